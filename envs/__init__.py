@@ -1,0 +1,1 @@
+"""Tasks: where behaviours come from."""

@@ -1,0 +1,105 @@
+"""What can be chosen by `kind`: a table of names, plus the entry points of installed packages.
+
+A config file names a kind; only this table or an installed package's entry points can tie a kind to code.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict
+
+Role: TypeAlias = Literal["tasks", "labelers", "rewards", "learners", "selectors"]
+
+
+class ConfigError(ValueError):
+    """A setting is wrong. The message says where, what was expected and what came."""
+
+
+class Settings(BaseModel):
+    """A component's settings: frozen, strict about unknown keys, documented by its attributes' docstrings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+TABLE: dict[Role, dict[str, str]] = {
+    "tasks": {
+        "control": "prefrl.envs.control:ControlSettings",
+        "reviews": "prefrl.envs.text:ReviewsSettings",
+    },
+    "labelers": {
+        "oracle": "prefrl.label.oracle:OracleSettings",
+        "terminal": "prefrl.label.terminal:TerminalSettings",
+    },
+    "rewards": {
+        "mlp": "prefrl.reward_models.mlp:MLPSettings",
+        "transformer": "prefrl.reward_models.text:TransformerSettings",
+    },
+    "learners": {
+        "ppo": "prefrl.improve.control:PPOSettings",
+        "sb3": "prefrl.improve.sb3:SB3Settings",
+        "text": "prefrl.improve.text:TextSettings",
+    },
+    "selectors": {
+        "uniform": "prefrl.sample.select:UniformSettings",
+        "disagreement": "prefrl.sample.select:DisagreementSettings",
+    },
+}
+EXTRAS = {
+    "gymnasium": "control",
+    "mujoco": "control",
+    "stable_baselines3": "control",
+    "transformers": "text",
+    "tokenizers": "text",
+    "vaderSentiment": "text",
+    "av": "label",
+}
+
+
+@cache
+def plugins(role: Role) -> dict[str, EntryPoint]:
+    """Kinds added by installed packages, through the entry-point group `prefrl.<role>`."""
+    return {point.name: point for point in entry_points(group=f"prefrl.{role}")}
+
+
+def kinds(role: Role) -> list[str]:
+    return sorted({*TABLE[role], *plugins(role)})
+
+
+def settings_class(role: Role, kind: str) -> type[Settings]:
+    """The settings class behind a kind; loads its module. Raises `ConfigError` with the nearest name."""
+    if kind not in kinds(role):
+        raise ConfigError(f"unknown {role[:-1]} kind {kind!r}; {suggest(kind, kinds(role))}")
+    try:
+        found = plugins(role)[kind].load() if kind in plugins(role) else _load(TABLE[role][kind])
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{role[:-1]} kind {kind!r}: {missing(error)}") from error
+    if not (isinstance(found, type) and issubclass(found, Settings)):
+        raise ConfigError(
+            f"{role[:-1]} kind {kind!r} must name a subclass of prefrl.components.Settings, got {found!r}"
+        )
+    return found
+
+
+def missing(error: ModuleNotFoundError) -> str:
+    """What to install when an optional package is absent."""
+    top = (error.name or "").split(".")[0]
+    extra = EXTRAS.get(top)
+    return f"needs the package {top!r}; run: pip install 'prefrl[{extra}]'" if extra else str(error)
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """A hint for a misspelt name: the nearest known one, or all of them."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else f"choose from: {', '.join(known)}"
+
+
+def _load(path: str) -> object:
+    module, name = path.split(":")
+    return getattr(import_module(module), name)

@@ -1,0 +1,182 @@
+"""The policy-gradient core: pure functions over masked (B, L) tensors, shared by control and text.
+
+A row is an episode, or a response: its steps are actions, or tokens. `mask` (B, L) is 1 on real steps and 0 on
+padding. REINFORCE, RLOO, GRPO and PPO are choices of baseline, advantage, clip and KL placement from this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+Reduction: TypeAlias = Literal["token", "sequence", "constant"]
+MAX_LOG_RATIO = 20.0
+"""Log-ratios are clamped to this before exp, so that one improbable token cannot make infinities."""
+
+
+# --- Masked statistics ------------------------------------------------------------------------------------------
+
+
+def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
+    """The mean over real steps; 0 where there are none. Padding may hold anything, NaN included."""
+    return torch.where(mask.bool(), x, 0.0).sum() / mask.sum().clamp(min=1)
+
+
+def masked_whiten(x: Tensor, mask: Tensor, shift_mean: bool = True, eps: float = 1e-8) -> Tensor:
+    """Scale to unit (biased) variance over real steps, and shift to mean 0 unless told not to; padding becomes 0.
+
+    Rewards are whitened with `shift_mean=False`: shifting would change the sign of sparse ones.
+    """
+    mean = masked_mean(x, mask)
+    variance = masked_mean((x - mean) ** 2, mask)
+    white = (x - mean) * torch.rsqrt(variance + eps)
+    return torch.where(mask.bool(), white if shift_mean else white + mean * torch.rsqrt(variance + eps), 0.0)
+
+
+def reduce(x: Tensor, mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
+    """One number from per-step losses (B, L).
+
+    - token: the mean over all real steps (DAPO, PPO). Long rows weigh more.
+    - sequence: the mean over rows of each row's mean (GRPO). A step of a long row weighs less.
+    - constant: the sum divided by B x constant (REINFORCE, RLOO, Dr. GRPO). No length bias: with constant = 1 the
+      gradient of the expected return itself.
+    """
+    x = torch.where(mask.bool(), x, 0.0)
+    if how == "token":
+        return x.sum() / mask.sum().clamp(min=1)
+    if how == "sequence":
+        return (x.sum(1) / mask.sum(1).clamp(min=1)).mean()
+    return x.sum() / (len(x) * constant)
+
+
+# --- Rewards, returns, advantages -------------------------------------------------------------------------------
+
+
+def step_rewards(scores: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tensor:
+    """(B, L) rewards of responses: -beta x kl at each token, and the score (B,) at the last real one.
+
+    Ziegler et al. 2019, equation 2, with the KL written per token (estimator k1).
+    """
+    last = (mask.sum(1).long() - 1).clamp(min=0)
+    rewards = torch.where(mask.bool(), -beta * kl, 0.0)
+    return rewards.scatter_add(1, last[:, None], (scores * mask.any(1))[:, None].to(rewards.dtype))
+
+
+def returns_to_go(rewards: Tensor, mask: Tensor, discount: float = 1.0) -> Tensor:
+    """(B, L): the discounted sum of the rewards from each step on; padding is 0."""
+    rewards = torch.where(mask.bool(), rewards, 0.0)
+    if discount == 1.0:
+        return rewards.flip(1).cumsum(1).flip(1) * mask
+    running, out = torch.zeros_like(rewards[:, 0]), torch.empty_like(rewards)
+    for t in range(rewards.shape[1] - 1, -1, -1):
+        running = rewards[:, t] + discount * running
+        out[:, t] = running
+    return out * mask
+
+
+def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, discount: float, trace: float) -> Tensor:
+    """(B, L) generalised advantages (Schulman et al. 2016, equation 16).
+
+    `next_values` is the value of what each step led to: 0 after a termination, the value of the final observation
+    after a truncation. `ends` is 1 where an episode stops, for either reason. Padding must be 0 in every argument.
+    """
+    delta = rewards + discount * next_values - values
+    keep = discount * trace * (1.0 - ends.to(delta.dtype))
+    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)
+    for t in range(delta.shape[1] - 1, -1, -1):
+        running = delta[:, t] + keep[:, t] * running
+        out[:, t] = running
+    return out
+
+
+def leave_one_out(scores: Tensor) -> Tensor:
+    """(P, K) scores of K responses to each of P prompts, minus the mean of the other K - 1 (RLOO, Ahmadian 2024)."""
+    count = scores.shape[1]
+    if count < 2:
+        raise ValueError(f"leave-one-out needs at least 2 responses a prompt, got {count}")
+    return (scores - scores.mean(1, keepdim=True)) * (count / (count - 1))
+
+
+def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
+    """(P, K) scores minus their group's mean, over its (unbiased) std plus eps (GRPO, Shao et al. 2024).
+
+    A group of equal scores gets exactly 0.
+    """
+    if scores.shape[1] < 2:
+        raise ValueError(f"group normalisation needs at least 2 responses a prompt, got {scores.shape[1]}")
+    centred = scores - scores.mean(1, keepdim=True)
+    equal = (scores == scores[:, :1]).all(1, keepdim=True)
+    return torch.where(equal, 0.0, centred / (scores.std(1, keepdim=True) + eps))
+
+
+# --- Losses, one number a step ----------------------------------------------------------------------------------
+
+
+def log_ratio(logp: Tensor, old_logp: Tensor, mask: Tensor) -> Tensor:
+    """log pi(a) - log pi_old(a), clamped; 0 on padding, whatever it holds."""
+    return torch.where(mask.bool(), logp - old_logp, 0.0).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
+
+
+def policy_gradient(logp: Tensor, advantages: Tensor) -> Tensor:
+    """REINFORCE (Williams 1992): minus log pi(a) x advantage, whose gradient is the policy gradient."""
+    return -logp * advantages.detach()
+
+
+def clipped_surrogate(log_ratios: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """PPO's pessimistic surrogate, negated (Schulman et al. 2017, equation 7); at ratio 1 its gradient is REINFORCE's."""
+    ratio = log_ratios.exp()
+    return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
+
+
+def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip: float | None = None) -> Tensor:
+    """Half the squared error; with a clip the larger one of the free and the clipped prediction's (PPO2)."""
+    free = (values - returns) ** 2
+    if clip is None:
+        return 0.5 * free
+    near = old_values + (values - old_values).clamp(-clip, clip)
+    return 0.5 * torch.maximum(free, (near - returns) ** 2)
+
+
+def categorical_entropy(logits: Tensor) -> Tensor:
+    """(..., V) -> (...): entropy in nats."""
+    logp = logits.log_softmax(-1)
+    return -(logp.exp() * logp).sum(-1)
+
+
+# --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------
+# With d = log pi(a) - log ref(a). As a number k1 and k3 are unbiased. As a loss only k2's gradient is that of the
+# KL (on samples of pi itself): k1's is 0 in expectation and k3's is that of the other direction, KL(ref || pi).
+
+
+def kl_k1(logp: Tensor, ref_logp: Tensor) -> Tensor:
+    """d: unbiased, can be negative, high variance. For use in the reward."""
+    return logp - ref_logp
+
+
+def kl_k2(logp: Tensor, ref_logp: Tensor) -> Tensor:
+    """d^2 / 2: biased as a number, the right gradient as a loss."""
+    return 0.5 * (logp - ref_logp) ** 2
+
+
+def kl_k3(logp: Tensor, ref_logp: Tensor) -> Tensor:
+    """exp(-d) - 1 + d: unbiased, never negative, low variance. For reports."""
+    d = (logp - ref_logp).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
+    return torch.expm1(-d) + d
+
+
+@dataclass(frozen=True)
+class AdaptiveKL:
+    """A KL coefficient steered to a target in nats per sequence (Ziegler et al. 2019, section 2.2)."""
+
+    beta: float = 0.15
+    target: float = 6.0
+    horizon: float = 10_000.0
+    """Sequences over which the coefficient reacts."""
+
+    def update(self, kl: float, sequences: int) -> AdaptiveKL:
+        """`kl`: the mean KL per sequence (not per token) over the last `sequences`."""
+        error = min(max(kl / self.target - 1.0, -0.2), 0.2)
+        return replace(self, beta=self.beta * (1.0 + error * sequences / self.horizon))

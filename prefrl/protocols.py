@@ -1,0 +1,245 @@
+"""The roles: what a task, a labeler, a store, a reward model, a learner and a selector must be able to do.
+
+Interfaces only; nothing inherits from them. Every component that fits one can be named in a config.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from prefrl.types import (
+    Answer,
+    C,
+    C_contra,
+    Evaluation,
+    Floats,
+    Judged,
+    Metrics,
+    Query,
+    Response,
+    Segment,
+    State,
+    Steps,
+)
+
+if TYPE_CHECKING:
+    import torch
+    from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
+
+class Task(Protocol):
+    """Where behaviours come from."""
+
+    @property
+    def name(self) -> str:
+        """What people call it, "Pendulum-v1" say."""
+
+    @property
+    def kind(self) -> str:
+        """ "control" or "text"."""
+
+
+class Transition(NamedTuple):
+    """One step of n environments side by side."""
+
+    observations: Floats
+    """(n, O): what the next action is chosen from; already of the new episode where one has ended."""
+    rewards: Floats
+    """(n,): the gold. Nothing that learns may read it."""
+    terminated: np.ndarray
+    """(n,) bool: the episode reached a state without a future (value 0)."""
+    truncated: np.ndarray
+    """(n,) bool: the time was up; the future goes on unseen, so bootstrap."""
+    final_observations: Floats
+    """(n, O): what this step led to, before any reset."""
+
+
+class Environments(Protocol):
+    """n environments stepped together. An episode that ends is reset in the same step."""
+
+    def reset(self, rng: np.random.Generator) -> Floats:
+        """Start n new episodes; (n, O) float32."""
+
+    def step(self, actions: Floats) -> Transition:
+        """actions (n, A) float32: within the bounds for boxes, one-hot for discrete actions."""
+
+    def states(self) -> Floats | None:
+        """(n, S) float64 simulator states, enough to draw each environment as it stands, or None."""
+
+
+class ControlTask(Task, Protocol):
+    """Episodes of a simulator."""
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode is cut."""
+
+    @property
+    def segment_steps(self) -> int:
+        """T of the segments that are judged."""
+
+    @property
+    def observation_size(self) -> int: ...
+
+    @property
+    def action_size(self) -> int: ...
+
+    @property
+    def action_bounds(self) -> tuple[Floats, Floats] | None:
+        """(low (A,), high (A,)), or None where actions are discrete (one-hot)."""
+
+    @property
+    def fps(self) -> float:
+        """Control steps per second of simulated time."""
+
+    def environments(self, count: int) -> Environments: ...
+
+    def frames(self, segment: Segment) -> np.ndarray:
+        """(T, H, W, 3) uint8 pictures of a segment, drawn from its states."""
+
+
+class TextTask(Task, Protocol):
+    """Prompts to be answered by a small language model."""
+
+    @property
+    def tokenizer(self) -> PreTrainedTokenizerBase: ...
+
+    @property
+    def response_tokens(self) -> int:
+        """The most tokens that a response may have, the end token included."""
+
+    def model(self) -> PreTrainedModel:
+        """A fresh copy of the starting policy, in float32, with dropout off."""
+
+    def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
+        """Prompts to learn and to ask about."""
+
+    def evaluation_prompts(self, count: int, rng: np.random.Generator) -> list[str]: ...
+
+    def gold(self, responses: Sequence[Response]) -> Floats:
+        """(N,) the hidden value of each response, or NaN where the task has none."""
+
+    def fluency(self, responses: Sequence[Response]) -> Floats | None:
+        """(N,) 1 where a response is well formed, else 0; None where the task cannot tell."""
+
+
+class Labeler(Protocol[C]):
+    """Who answers."""
+
+    @property
+    def name(self) -> str: ...
+
+    def answer(self, store: Store[C], rng: np.random.Generator) -> None:
+        """Answer open queries of the store: all of them now (an oracle), or as far as people have come."""
+
+
+class Store(Protocol[C]):
+    """Every behaviour asked about and every answer given, append-only."""
+
+    def ask(self, queries: Sequence[Query[C]]) -> None:
+        """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
+
+    def open_queries(self) -> list[Query[C]]:
+        """Queries without an answer, oldest first. Their candidates carry no gold."""
+
+    def answer(self, answers: Sequence[Answer]) -> None:
+        """Add answers, in one transaction; one per query and labeler, the first stands."""
+
+    def judged(self, upto: int | None = None) -> list[Judged[C]]:
+        """Queries with their judgements, in the order in which they were given, up to a sequence number."""
+
+    def gold(self, candidates: Sequence[C]) -> list[Floats]:
+        """The hidden values of candidates: for oracles and evaluation only."""
+
+    @property
+    def sequence(self) -> int:
+        """The number of the newest event: the snapshot that a fit is made on."""
+
+    def counts(self) -> dict[str, int]:
+        """Queries asked, answered, skipped."""
+
+
+class RewardModel(Protocol[C_contra]):
+    """What is fitted. One network is an ensemble of E = 1; members are evaluated in one batched pass."""
+
+    @property
+    def members(self) -> int:
+        """E."""
+
+    @property
+    def fitted(self) -> bool:
+        """False until the first fit: its disagreement is then noise."""
+
+    def stack(self, candidates: Sequence[C_contra]) -> Mapping[str, torch.Tensor]:
+        """Candidates as padded tensors with N in front, made once per fit."""
+
+    def scores(self, stacked: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """(E, N) raw scores of stacked candidates, differentiable."""
+
+    def parameters(self) -> Iterable[torch.nn.Parameter]: ...
+
+    def settle(self, stacked: Mapping[str, torch.Tensor]) -> None:
+        """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates."""
+
+    def member_scores(self, candidates: Sequence[C_contra]) -> Floats:
+        """(E, N) scores after each member's shift and scale, without gradients."""
+
+    def score(self, candidates: Sequence[C_contra]) -> Floats:
+        """(N,) what learners optimise: the members' mean of `member_scores`."""
+
+    def state(self) -> State: ...
+
+    def load(self, state: State) -> None: ...
+
+
+class StepRewardModel(RewardModel[Segment], Protocol):
+    """A reward model for control: a segment's score is the sum of its steps' rewards."""
+
+    def rewards(self, observations: Floats, actions: Floats) -> Floats:
+        """(B, T) rewards of observations (B, T, O) and actions (B, T, A): shifted, scaled, averaged over members."""
+
+
+class Learner(Protocol[C]):
+    """A policy that samples candidates, and gets better at good ones."""
+
+    @property
+    def steps(self) -> Steps:
+        """What has been spent so far, by purpose."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> list[C]:
+        """At least `count` candidates of the current policy, gold attached (the store files it apart)."""
+
+    def improve(self, reward: RewardModel[C], store: Store[C], rng: np.random.Generator) -> Metrics:
+        """One round's worth of learning: from the reward (reinforcement) or from the judgements (direct methods)."""
+
+    def evaluate(self, reward: RewardModel[C], rng: np.random.Generator) -> Evaluation[C]:
+        """Fresh episodes or responses; metrics `gold`, `learned` and what else the kind has (kl, fluency, length)."""
+
+    def state(self) -> State: ...
+
+    def load(self, state: State) -> None: ...
+
+
+class Selector(Protocol[C]):
+    """Which candidates are worth a label."""
+
+    def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
+        """At most `count` queries over candidates of the pool."""
+
+
+__all__ = [
+    "ControlTask",
+    "Environments",
+    "Labeler",
+    "Learner",
+    "RewardModel",
+    "Selector",
+    "StepRewardModel",
+    "Store",
+    "Task",
+    "TextTask",
+    "Transition",
+]

@@ -1,0 +1,1 @@
+"""Stage 1: which behaviours to ask about."""

@@ -1,0 +1,286 @@
+"""The vocabulary: what is judged, what is asked, what is answered. NumPy and the standard library only.
+
+Shape letters, everywhere: T steps, O observation, A action, K candidates in a query, N candidates in a
+batch, M comparisons, E ensemble members, B sequences, L tokens, V vocabulary.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+Floats: TypeAlias = npt.NDArray[np.floating[Any]]
+Integers: TypeAlias = npt.NDArray[np.integer[Any]]
+Metrics: TypeAlias = dict[str, float]
+State: TypeAlias = dict[str, Any]
+"""Nested dicts and lists of arrays, tensors, numbers, strings and None: what a checkpoint can hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """A piece of one episode."""
+
+    observations: Floats
+    """(T, O) float32: what was seen before each action, never normalised."""
+    actions: Floats
+    """(T, A) float32: what the environment executed; one-hot where actions are discrete."""
+    episode: str
+    """Which episode it was cut from; unique within a run."""
+    start: int
+    """Its first step within the episode."""
+    states: Floats | None = None
+    """(T, S) float64 simulator states, enough to draw it again; None where the simulator has none."""
+    gold: Floats | None = None
+    """(T,) the task's own rewards. Hidden: the store keeps it apart, nothing that learns may read it."""
+
+    context: Literal[""] = ""
+    """Candidates of one context may be compared; every segment may be compared with every other."""
+
+    def __post_init__(self) -> None:
+        if self.observations.ndim != 2 or self.actions.ndim != 2 or len(self.observations) != len(self.actions):
+            raise ValueError(
+                f"a segment needs observations (T, O) and actions (T, A) of equal length, "
+                f"got {self.observations.shape} and {self.actions.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    @cached_property
+    def id(self) -> str:
+        """sha256 over names, dtypes, shapes and bytes (C order). The gold is not part of it."""
+        arrays = {"observations": self.observations, "actions": self.actions, "states": self.states}
+        return _digest(f"{self.episode}/{self.start}", {k: v for k, v in arrays.items() if v is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a language model wrote after a prompt."""
+
+    prompt: str
+    text: str
+    """The response alone, decoded, without special tokens."""
+    prompt_tokens: tuple[int, ...] = ()
+    tokens: tuple[int, ...] = ()
+    """As sampled, the end token included when there is one: never decoded and encoded again (token in, token out)."""
+    gold: Floats | None = None
+    """(1,) the task's own score. Hidden, as in `Segment`."""
+
+    @property
+    def context(self) -> str:
+        """Only responses to one prompt may be compared."""
+        return self.prompt
+
+    @cached_property
+    def id(self) -> str:
+        """sha256 over prompt, text and tokens. The gold is not part of it."""
+        tokens = {"prompt_tokens": np.array(self.prompt_tokens, np.int64), "tokens": np.array(self.tokens, np.int64)}
+        return _digest(f"{self.prompt}\0{self.text}", tokens)
+
+
+Candidate: TypeAlias = Segment | Response
+C = TypeVar("C", Segment, Response)
+C_contra = TypeVar("C_contra", Segment, Response, contravariant=True)
+
+
+def gold_score(candidate: Candidate) -> float:
+    """The gold of a whole candidate: the sum over its steps. For oracles and evaluation only."""
+    if candidate.gold is None:
+        raise ValueError(
+            f"candidate {candidate.id[:12]} carries no gold: only an oracle or an evaluation may ask, "
+            "and only where the task has one"
+        )
+    return float(candidate.gold.sum())
+
+
+@dataclass(frozen=True)
+class Query(Generic[C]):
+    """K >= 2 distinct candidates of one context, put side by side, unanswered."""
+
+    candidates: tuple[C, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.candidates) < 2:
+            raise ValueError(f"a query needs at least 2 candidates, got {len(self.candidates)}")
+        if len({c.id for c in self.candidates}) < len(self.candidates):
+            raise ValueError("a query may not compare a candidate with itself")
+        if len({c.context for c in self.candidates}) > 1:
+            raise ValueError("the candidates of a query must share one context (one prompt)")
+
+    @cached_property
+    def id(self) -> str:
+        """sha256 over the candidates' ids, in any order: asking twice is asking once."""
+        return hashlib.sha256("".join(sorted(c.id for c in self.candidates)).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two candidates judged."""
+
+    query: str
+    preference: float
+    """In [0, 1]: the probability that the first candidate is better; 0.5 is a tie."""
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+    """The order in which the candidates were shown; the preference itself is in the query's own order."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.preference <= 1.0:
+            raise ValueError(f"a preference must lie in [0, 1], got {self.preference}")
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """K candidates judged."""
+
+    query: str
+    ranks: tuple[int, ...]
+    """A rank for each candidate, in the query's own order; 0 is best, equal ranks are ties."""
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.ranks) < 2 or min(self.ranks) < 0:
+            raise ValueError(f"a ranking needs a rank >= 0 for each of at least 2 candidates, got {self.ranks}")
+
+
+@dataclass(frozen=True)
+class Skip:
+    """No judgement. A skip may be asked again of someone else; incomparable says that there is no answer."""
+
+    query: str
+    reason: Literal["skip", "incomparable"] = "skip"
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+
+
+Judgement: TypeAlias = Comparison | Ranking
+Answer: TypeAlias = Comparison | Ranking | Skip
+
+
+@dataclass(frozen=True)
+class Judged(Generic[C]):
+    """A query with one judgement on it."""
+
+    query: Query[C]
+    judgement: Judgement
+
+
+@dataclass(frozen=True, eq=False)
+class Batch(Generic[C]):
+    """Judgements as a graph: every candidate once, comparisons as edges between them."""
+
+    candidates: tuple[C, ...]
+    """N distinct candidates: each is scored once, however often it was compared."""
+    edges: Integers
+    """(M, 2) int64: indices of the two candidates compared."""
+    preference: Floats
+    """(M,) float32 in [0, 1]: the probability that edge[0] is better."""
+    weight: Floats
+    """(M,) float32: the pairs implied by one ranking of K candidates share a weight of K - 1."""
+    group: Integers
+    """(M,) int64: which judgement each edge came from; edges of one group are not independent."""
+
+    def __len__(self) -> int:
+        return len(self.edges)
+
+    def subset(self, keep: npt.NDArray[np.bool_]) -> Batch[C]:
+        """The same candidates with only the edges where `keep` (M,) is true."""
+        return replace(
+            self,
+            edges=self.edges[keep],
+            preference=self.preference[keep],
+            weight=self.weight[keep],
+            group=self.group[keep],
+        )
+
+
+def batch(judged: Sequence[Judged[C]]) -> Batch[C]:
+    """Turn judgements into a `Batch`; a ranking becomes all the pairs that it implies."""
+    index: dict[str, int] = {}
+    candidates: list[C] = []
+    rows: list[tuple[int, int, float, float, int]] = []
+    for group, one in enumerate(judged):
+        for candidate in one.query.candidates:
+            if index.setdefault(candidate.id, len(candidates)) == len(candidates):
+                candidates.append(candidate)
+        at = [index[c.id] for c in one.query.candidates]
+        pairs = implied_pairs(one.judgement)
+        share = (len(at) - 1) / max(len(pairs), 1)
+        rows += [(at[i], at[j], preference, share, group) for i, j, preference in pairs]
+    columns = list(zip(*rows, strict=True)) if rows else [(), (), (), (), ()]
+    return Batch(
+        candidates=tuple(candidates),
+        edges=np.array([columns[0], columns[1]], np.int64).T.reshape(-1, 2),
+        preference=np.array(columns[2], np.float32),
+        weight=np.array(columns[3], np.float32),
+        group=np.array(columns[4], np.int64),
+    )
+
+
+def implied_pairs(judgement: Judgement) -> list[tuple[int, int, float]]:
+    """(i, j, preference that i is better), one for each pair of candidates that the judgement speaks of."""
+    if isinstance(judgement, Comparison):
+        return [(0, 1, judgement.preference)]
+    ranks = judgement.ranks
+    return [
+        (i, j, 0.5 + 0.5 * float(np.sign(ranks[j] - ranks[i])))
+        for i in range(len(ranks))
+        for j in range(i + 1, len(ranks))
+    ]
+
+
+class Steps(NamedTuple):
+    """What was spent: `env.step` calls for control, generated tokens for text, each counted once, by purpose."""
+
+    learn: int = 0
+    query: int = 0
+    evaluate: int = 0
+
+    def add(self, learn: int = 0, query: int = 0, evaluate: int = 0) -> Steps:
+        return Steps(self.learn + learn, self.query + query, self.evaluate + evaluate)
+
+
+@dataclass(frozen=True)
+class Evaluation(Generic[C]):
+    """How a policy does, and a few candidates to look at."""
+
+    metrics: Metrics
+    examples: tuple[C, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit came to."""
+
+    metrics: Metrics
+    predicted: Floats
+    """(M,) the reward model's probability that the first is better, on the held-out comparisons."""
+    preference: Floats
+    """(M,) what was judged there."""
+
+
+@dataclass(frozen=True)
+class Round(Generic[C]):
+    """One turn of the loop. Round 0 only evaluates the starting policy."""
+
+    number: int
+    metrics: Metrics
+    """Keys `stage/name`; docs/metrics.md gives each one's formula and unit."""
+    examples: tuple[C, ...] = field(default=(), repr=False)
+    fitted: Fitted | None = field(default=None, repr=False)
+    """This round's fit; None in round 0 and where there was nothing to fit on."""
+
+
+def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
+    digest = hashlib.sha256(header.encode("utf-8", "surrogatepass"))
+    for name, array in arrays.items():
+        digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
