@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict
 
@@ -25,6 +25,14 @@ class Settings(BaseModel):
     """A component's settings: frozen, strict about unknown keys, documented by its attributes' docstrings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+    def shrunk(self) -> Self:
+        """The same with as little work as still makes sense: for dry runs and tests."""
+        return self
+
+    def work(self) -> float:
+        """How much a round takes, in any unit: a dry run compares it with that of the shrunk settings."""
+        return 1.0
 
 
 TABLE: dict[Role, dict[str, str]] = {

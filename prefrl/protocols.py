@@ -6,7 +6,7 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -142,11 +142,14 @@ class Store(Protocol[C]):
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
 
-    def open_queries(self) -> list[Query[C]]:
-        """Queries without an answer, oldest first. Their candidates carry no gold."""
+    def open_queries(self, labeler: str = "") -> list[Query[C]]:
+        """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
 
     def answer(self, answers: Sequence[Answer]) -> None:
-        """Add answers, in one transaction; one per query and labeler, the first stands."""
+        """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
+
+    def retract(self, query: str, labeler: str) -> None:
+        """Take a labeler's answer back; the log keeps both."""
 
     def judged(self, upto: int | None = None) -> list[Judged[C]]:
         """Queries with their judgements, in the order in which they were given, up to a sequence number."""
@@ -195,6 +198,7 @@ class RewardModel(Protocol[C_contra]):
     def load(self, state: State) -> None: ...
 
 
+@runtime_checkable
 class StepRewardModel(RewardModel[Segment], Protocol):
     """A reward model for control: a segment's score is the sum of its steps' rewards."""
 

@@ -104,8 +104,10 @@ class Query(Generic[C]):
     """K >= 2 distinct candidates of one context, put side by side, unanswered."""
 
     candidates: tuple[C, ...]
+    """In the order of their ids, whatever order came: what is first says nothing, and asking twice is asking once."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "candidates", tuple(sorted(self.candidates, key=lambda c: c.id)))
         if len(self.candidates) < 2:
             raise ValueError(f"a query needs at least 2 candidates, got {len(self.candidates)}")
         if len({c.id for c in self.candidates}) < len(self.candidates):
@@ -115,8 +117,8 @@ class Query(Generic[C]):
 
     @cached_property
     def id(self) -> str:
-        """sha256 over the candidates' ids, in any order: asking twice is asking once."""
-        return hashlib.sha256("".join(sorted(c.id for c in self.candidates)).encode()).hexdigest()
+        """sha256 over the candidates' ids."""
+        return hashlib.sha256("".join(c.id for c in self.candidates).encode()).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -44,12 +44,17 @@ def reduce(x: Tensor, mask: Tensor, how: Reduction = "token", constant: float = 
     - constant: the sum divided by B x constant (REINFORCE, RLOO, Dr. GRPO). No length bias: with constant = 1 the
       gradient of the expected return itself.
     """
-    x = torch.where(mask.bool(), x, 0.0)
+    return (torch.where(mask.bool(), x, 0.0) * step_weights(mask, how, constant)).sum()
+
+
+def step_weights(mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
+    """(B, L): what each step counts in `reduce`; 0 on padding. With these a batch can be summed up a part at a time."""
+    real = mask.to(torch.get_default_dtype())
     if how == "token":
-        return x.sum() / mask.sum().clamp(min=1)
+        return real / real.sum().clamp(min=1)
     if how == "sequence":
-        return (x.sum(1) / mask.sum(1).clamp(min=1)).mean()
-    return x.sum() / (len(x) * constant)
+        return real / real.sum(1, keepdim=True).clamp(min=1) / len(real)
+    return real / (len(real) * constant)
 
 
 # --- Rewards, returns, advantages -------------------------------------------------------------------------------
@@ -126,7 +131,10 @@ def policy_gradient(logp: Tensor, advantages: Tensor) -> Tensor:
 
 
 def clipped_surrogate(log_ratios: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """PPO's pessimistic surrogate, negated (Schulman et al. 2017, equation 7); at ratio 1 its gradient is REINFORCE's."""
+    """PPO's pessimistic surrogate, negated (Schulman et al. 2017, equation 7).
+
+    At ratio 1 its gradient is that of `policy_gradient`.
+    """
     ratio = log_ratios.exp()
     return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
 

@@ -1,0 +1,91 @@
+"""The text task: write a review that begins with a given prompt. The gold is how positive it is (VADER)."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
+from vaderSentiment.vaderSentiment import SentimentIntensityAnalyzer
+
+from prefrl.components import Settings
+from prefrl.envs.cloning import CloningSettings
+from prefrl.envs.grammar import Grammar
+from prefrl.envs.reviews import reviews, source
+from prefrl.types import Floats, Response
+
+EVALUATION_SHARE = 8
+
+
+class ReviewsSettings(Settings):
+    """Short reviews of films, meals, hotels, books and gadgets; the gold is VADER's compound score."""
+
+    kind: Literal["reviews"] = "reviews"
+    response_tokens: int = Field(48, ge=2)
+    """The most tokens that a response may have, the end token included."""
+    cloning: CloningSettings = CloningSettings()
+    """The starting policy."""
+
+    def build(self) -> Reviews:
+        grammar = reviews()
+        return Reviews(self, grammar, *self.cloning.build(grammar, source()))
+
+
+class Reviews:
+    """Prompts are openings of reviews; one in eight is kept for evaluation and never learned on."""
+
+    name = "reviews"
+    kind = "text"
+
+    def __init__(
+        self,
+        settings: ReviewsSettings,
+        grammar: Grammar,
+        model: LlamaForCausalLM,
+        tokenizer: PreTrainedTokenizerFast,
+    ) -> None:
+        self.response_tokens = settings.response_tokens
+        self.tokenizer = tokenizer
+        self._model = model
+        self._grammar = grammar
+        self._vader = SentimentIntensityAnalyzer()
+
+    def model(self) -> LlamaForCausalLM:
+        """A fresh copy of the cloned model, in float32; it has no dropout."""
+        return copy.deepcopy(self._model)
+
+    def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
+        return self._draw(count, rng, evaluation=False)
+
+    def evaluation_prompts(self, count: int, rng: np.random.Generator) -> list[str]:
+        return self._draw(count, rng, evaluation=True)
+
+    def gold(self, responses: Sequence[Response]) -> Floats:
+        """(N,) VADER's compound score in [-1, 1] (Hutto and Gilbert 2014) of the whole review.
+
+        The prompt is scored along, since a reader sees it and VADER's negations reach across its end; on their own
+        all prompts score 0.
+        """
+        scores = [self._vader.polarity_scores(r.prompt + r.text)["compound"] for r in responses]
+        return np.array(scores, np.float32)
+
+    def fluency(self, responses: Sequence[Response]) -> Floats:
+        """(N,) 1 where the grammar could have written prompt and response, to the last full stop, else 0."""
+        return np.array([self._grammar.accepts(r.prompt + r.text) for r in responses], np.float32)
+
+    def _draw(self, count: int, rng: np.random.Generator, evaluation: bool) -> list[str]:
+        found: list[str] = []
+        while len(found) < count:
+            prompt, _ = self._grammar.sample(rng)
+            if _for_evaluation(prompt) == evaluation:
+                found.append(prompt)
+        return found
+
+
+def _for_evaluation(prompt: str) -> bool:
+    """By a digest of the words: the split is the same in every run."""
+    return hashlib.sha256(prompt.encode()).digest()[0] % EVALUATION_SHARE == 0

@@ -1,0 +1,250 @@
+"""The command line. Every command is a few lines over a function that Python users call as well."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
+    from prefrl.config import Config
+    from prefrl.rundir import Run
+
+app = typer.Typer(
+    help="Learn what people prefer, and act on it: sample, label, fit, improve, evaluate.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`) or a YAML file.")]
+Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
+Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]
+Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
+
+
+class Form(StrEnum):
+    """How judgements lie in files."""
+
+    preferences = "preferences"
+    bundle = "bundle"
+
+
+@app.command()
+def run(
+    source: Source,
+    overrides: Overrides = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The run's folder.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option(help="Build everything, run a small round, estimate time, write nothing.")
+    ] = False,
+) -> None:
+    """Run the whole loop. The same command on the same folder goes on where it stopped."""
+    from prefrl.rundir import Run
+
+    config = _load(source, overrides)
+    if dry_run:
+        _dry_run(config)
+        return
+    if out is None:
+        raise typer.BadParameter("say where the run goes: --out DIR (or --dry-run)")
+    _drive(Run(config, out))
+
+
+@app.command()
+def resume(folder: Folder) -> None:
+    """Go on with a run that was stopped."""
+    from prefrl.rundir import Run
+
+    _drive(Run.resume(folder))
+
+
+@app.command()
+def label(
+    source: Annotated[
+        str, typer.Argument(help="A preset, a YAML file, or the folder of a run whose policy is asked about.")
+    ],
+    overrides: Overrides = None,
+    out: Out = Path("labels"),
+    given: Annotated[
+        Path | None, typer.Option(help='JSON lines {"prompt", "responses"} to ask about.', exists=True)
+    ] = None,
+    terminal: Annotated[bool, typer.Option(help="Short for labeler.kind=terminal.")] = False,
+) -> None:
+    """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
+    from prefrl import stages
+    from prefrl.console import console
+    from prefrl.rundir import open_saved
+
+    policy = open_saved(source) if Path(source).is_dir() else None
+    path = str(policy.folder / "config.yaml") if policy else source
+    extra = ["labeler.kind=terminal", f"labeler.clips={out / 'clips'}"] if terminal else []
+    counts = stages.label(_load(path, [*extra, *(overrides or [])]), out, policy, given)
+    console.print(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skips, in {out}")
+
+
+@app.command()
+def fit(
+    source: Annotated[Path, typer.Argument(help="A folder with a store, or a file of prompt/chosen/rejected lines.")],
+    overrides: Overrides = None,
+    config: Annotated[str | None, typer.Option(help="Preset or YAML file; default: the folder's own.")] = None,
+    out: Out = Path("reward"),
+) -> None:
+    """Fit a reward model on judgements, and save it."""
+    from prefrl import stages
+    from prefrl.components import ConfigError
+    from prefrl.console import console, metrics_table
+
+    if config is None and not (source / "config.yaml").is_file():
+        raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
+    fitted = stages.fit_reward(_load(config or str(source / "config.yaml"), overrides), source, out)
+    console.print(metrics_table(f"reward model in {out}", fitted.metrics))
+
+
+@app.command()
+def improve(
+    source: Source,
+    overrides: Overrides = None,
+    reward: Annotated[Path, typer.Option(help="A run, or what `prefrl fit` wrote.", exists=True)] = Path("reward"),
+    out: Out = Path("policy"),
+) -> None:
+    """Improve a policy against a saved reward model."""
+    from prefrl import stages
+    from prefrl.rundir import Run
+
+    _drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
+
+
+@app.command()
+def evaluate(folder: Folder) -> None:
+    """Evaluate the newest policy of a run."""
+    from prefrl import stages
+    from prefrl.console import console, metrics_table
+
+    console.print(metrics_table(f"policy of {folder}", stages.evaluate(folder).metrics))
+
+
+@app.command()
+def report(folder: Folder) -> None:
+    """Write a run's report.html again, also while it goes on."""
+    from prefrl.console import console
+    from prefrl.evaluate.report import write_report
+
+    console.print(f"report: {write_report(folder)}")
+
+
+@app.command("export")
+def export_(
+    store: Annotated[Path, typer.Argument(help="A run's folder, or one that `prefrl label` wrote.", exists=True)],
+    to: Annotated[Path, typer.Option(help="A .jsonl file for preferences, a folder for a bundle.")],
+    form: Annotated[
+        Form, typer.Option(help="preferences: prompt/chosen/rejected lines; bundle: loses nothing.")
+    ] = Form.preferences,
+) -> None:
+    """Write judgements to files."""
+    from prefrl.console import console
+    from prefrl.label.exchange import export_bundle, export_preferences
+    from prefrl.store import Store
+
+    with Store[Any](store, write=False) as opened:
+        done = (export_preferences if form is Form.preferences else export_bundle)(opened, to)
+    console.print(f"{done.written} written to {to}" + (f", {done.ties} ties left out" if done.ties else ""))
+
+
+@app.command("import")
+def import_(
+    path: Annotated[Path, typer.Argument(help="A file of prompt/chosen/rejected lines, or a bundle.", exists=True)],
+    out: Out = Path("labels"),
+) -> None:
+    """Read judgements from files into a store, all or none."""
+    from prefrl.console import console
+    from prefrl.label.exchange import import_bundle, import_preferences
+    from prefrl.store import Store
+
+    with Store[Any](out) as store:
+        count = import_bundle(path, store) if path.is_dir() else import_preferences(path, store)
+    console.print(f"{count} judgements read into {out}")
+
+
+@app.command()
+def presets() -> None:
+    """List the presets."""
+    from prefrl.config import presets
+    from prefrl.console import console, table
+
+    console.print(table("presets: prefrl run NAME --out DIR", ("name", "what it shows"), presets().items()))
+
+
+@app.command()
+def describe(kind: Annotated[str | None, typer.Argument(help="A component's kind, or a preset.")] = None) -> None:
+    """Explain a component's settings, or a preset; without a name, list the kinds."""
+    from prefrl.console import console
+    from prefrl.explain import explain
+
+    for part in explain(kind):
+        console.print(part)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what is installed, what is missing, and what to do about it."""
+    from prefrl.console import console
+    from prefrl.doctor import diagnose
+
+    console.print(diagnose())
+
+
+def _load(source: str, overrides: list[str] | None) -> Config:
+    from prefrl.config import Config
+
+    return Config.load(source, overrides or [])
+
+
+def _drive(running: Run) -> None:
+    """Run to the end, telling how it goes; on Ctrl-C say how to go on."""
+    from prefrl.console import console, progress, round_line, summary_table
+
+    with running:
+        for note in running.notes:
+            console.print(note, style="yellow")
+        person = running.config.labeler.model_dump()["kind"] == "terminal"
+        try:
+            with progress(running.loop, quiet=person) as bar:
+                for round in running:
+                    bar.update(bar.task_ids[0], completed=round.number)
+                    console.print(round_line(round))
+        except KeyboardInterrupt:
+            console.print(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
+            raise
+        console.print(summary_table(running.summary))
+        console.print(f"report: {running.report()}")
+
+
+def _dry_run(config: Config) -> None:
+    from prefrl.console import console, duration
+    from prefrl.stages import estimate
+
+    seconds = estimate(config)
+    console.print(f"everything builds and one small round runs; the whole would take about {duration(seconds)}")
+
+
+def main() -> None:
+    """Turn a user's mistake into one line on stderr and exit status 2; PREFRL_DEBUG=1 shows where it came from."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (ValueError, FloatingPointError, ModuleNotFoundError) as error:
+        if os.environ.get("PREFRL_DEBUG"):
+            raise
+        from prefrl.components import missing
+        from prefrl.console import errors
+
+        text = missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
+        for line in text.splitlines():
+            errors.print(f"error: {line}", style="red", markup=False)
+        sys.exit(2)

@@ -1,0 +1,190 @@
+"""One tree of settings: the same words in Python, in YAML and on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
+from pydantic_core import ErrorDetails
+
+from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
+from prefrl.fit.trainer import FittingSettings
+from prefrl.loop import Loop, LoopSettings
+from prefrl.seeding import streams
+from prefrl.store import Store
+
+
+def _component(role: Role, value: object) -> Settings:
+    """Look up the settings class of a `kind`, and check the other settings against it."""
+    if isinstance(value, Settings):
+        return value
+    if not isinstance(value, dict) or not isinstance(value.get("kind"), str):
+        raise ConfigError(f": expected settings with a kind ({', '.join(kinds(role))}), got {value!r}")
+    try:
+        cls = settings_class(role, value["kind"])
+    except ConfigError as error:
+        raise ConfigError(f".kind: {error}") from None
+    try:
+        return cls.model_validate(value)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_explain(cls, one) for one in error.errors())) from None
+
+
+class Config(Settings):
+    """Everything that a run needs. A component is told by its `kind`; `prefrl describe KIND` lists its settings."""
+
+    task: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "tasks"))]
+    """Where behaviours come from."""
+    labeler: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "labelers"))] = Field(
+        {"kind": "oracle"}, validate_default=True
+    )
+    """Who answers."""
+    select: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "selectors"))] = Field(
+        {"kind": "uniform"}, validate_default=True
+    )
+    """Which candidates are worth a label."""
+    reward: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "rewards"))]
+    """What is fitted."""
+    fitting: FittingSettings = FittingSettings()
+    """How it is fitted."""
+    learner: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "learners"))]
+    """The policy, and how it gets better."""
+    loop: LoopSettings = LoopSettings()
+    """How often, and how much is asked."""
+    seed: int = Field(0, ge=0)
+    """All random numbers of the run come from this one."""
+
+    @classmethod
+    def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:
+        """Read a preset ("control/pendulum") or a YAML file, with `dotted.key=value` overrides.
+
+        Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
+        """
+        data = _read(source)
+        for override in overrides:
+            _apply(data, override)
+        return cls.parse(data)
+
+    @classmethod
+    def parse(cls, data: dict[str, Any]) -> Config:
+        """Check a nested dict. Raises `ConfigError`."""
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            raise ConfigError("\n".join(_explain(cls, one)[1:] for one in error.errors())) from None
+
+    def dump(self) -> str:
+        """YAML with every default spelled out; `Config.parse` of it gives the same settings back."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+    def build(self, store: Store[Any]) -> Loop[Any]:
+        """Make every component, and the loop that joins them, on an open store."""
+        rng = streams(self.seed, 0).build
+        parts: Any = self  # the settings classes are known by kind only
+        task = parts.task.build()
+        return Loop(
+            task=task,
+            learner=parts.learner.build(task, rng),
+            reward=parts.reward.build(task, rng),
+            labeler=parts.labeler.build(task),
+            selector=parts.select.build(),
+            store=store,
+            candidates=parts.select.candidates,
+            fitting=self.fitting,
+            settings=self.loop,
+            seed=self.seed,
+        )
+
+
+def presets() -> dict[str, str]:
+    """Name -> the first comment line of each preset that is shipped."""
+    found = {}
+    for folder in sorted(files("prefrl.configs").iterdir(), key=lambda f: f.name):
+        if folder.is_dir() and not folder.name.startswith("_"):
+            for file in sorted(folder.iterdir(), key=lambda f: f.name):
+                if file.name.endswith(".yaml"):
+                    found[f"{folder.name}/{file.name[:-5]}"] = _first_comment(file)
+    return found
+
+
+def _first_comment(file: Traversable) -> str:
+    return file.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+
+
+def _read(source: str | Path) -> dict[str, Any]:
+    """The settings in a file, or in a preset of that name."""
+    path = Path(source)
+    if path.is_file():
+        text = path.read_text(encoding="utf-8")
+    elif str(source) in (known := presets()):
+        text = files("prefrl.configs").joinpath(f"{source}.yaml").read_text(encoding="utf-8")
+    else:
+        raise ConfigError(f"{source}: no such preset or file; {suggest(str(source), known)}")
+    try:
+        data = yaml.load(text, _UniqueKeys)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{source}: not valid YAML: {error}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{source}: expected settings (key: value), got {type(data).__name__}")
+    return data
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """YAML without code, and without the silent loss of a key that is given twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        twice = [key for i, key in enumerate(keys) if key in keys[:i]]
+        if twice:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice[0]!r} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _apply(data: dict[str, Any], override: str) -> None:
+    """Set one `dotted.key=value`. A new kind drops the settings of the old one, which it may not know."""
+    path, sign, text = override.partition("=")
+    if not sign or not path:
+        raise ConfigError(f"{override!r}: expected dotted.key=value, for example learner.kind=sb3")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: {text!r} is not a YAML value: {error}") from None
+    *parents, last = path.split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise ConfigError(f"{path}: {parent} is a value, not a group of settings")
+    if last == "kind" and data.get("kind") != value:
+        data.clear()
+    data[last] = value
+
+
+def _explain(cls: type[Settings], error: ErrorDetails) -> str:
+    """One line a mistake: `.dotted.path: what was expected, what came`."""
+    path = "".join(f".{part}" for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        *parents, last = error["loc"]
+        known = _fields(cls, [str(p) for p in parents])
+        return f"{path}: unknown setting; {suggest(str(last), known)}"
+    if error["type"] == "missing":
+        return f"{path}: missing; expected a value"
+    if error["type"] == "value_error":
+        inner = str(error["ctx"]["error"])
+        return "\n".join(f"{path}{line if line[:1] in '.:' else ': ' + line}" for line in inner.splitlines())
+    expected = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return f"{path}: expected {expected}, got {error['input']!r}"
+
+
+def _fields(cls: type[Settings], parents: Iterable[str]) -> list[str]:
+    """The names of the settings in a group."""
+    for parent in parents:
+        annotation = cls.model_fields[parent].annotation
+        if isinstance(annotation, type) and issubclass(annotation, Settings):
+            cls = annotation
+    return list(cls.model_fields)

@@ -1,0 +1,125 @@
+"""What a person sees in the terminal: progress while a run goes on, a line for each round, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Task as Row
+from rich.table import Table
+from rich.text import Text
+
+from prefrl.loop import Loop
+from prefrl.types import Round
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+
+class _Stage(ProgressColumn):
+    """What goes on now, and how fast; read off the loop, which knows nothing of it."""
+
+    def __init__(self, loop: Loop[Any]) -> None:
+        super().__init__()
+        self.loop = loop
+        self.unit = "tokens" if loop.task.kind == "text" else "steps"
+
+    def render(self, task: Row) -> Text:
+        spent = sum(self.loop.learner.steps)
+        rate = (spent - task.fields["spent"]) / task.elapsed if task.elapsed else 0.0
+        return Text(f"{self.loop.stage:<9} {spent:>10,} {self.unit} {rate:>8,.0f}/s", style="cyan")
+
+
+@contextmanager
+def progress(loop: Loop[Any], quiet: bool) -> Iterator[Progress]:
+    """A bar over the rounds on a terminal; nothing elsewhere, or while a person is asked questions."""
+    columns = (SpinnerColumn(), TextColumn("round {task.completed:.0f}/{task.total:.0f}"), BarColumn(24), _Stage(loop))
+    bar = Progress(
+        *columns,
+        TimeElapsedColumn(),
+        _TimeLeft(),
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    )
+    with bar:
+        total = loop.settings.rounds
+        bar.add_task("run", total=total, completed=max(loop.round, 0), spent=sum(loop.learner.steps))
+        yield bar
+
+
+class _TimeLeft(ProgressColumn):
+    """Time left by the pace of the rounds so far."""
+
+    def render(self, task: Row) -> Text:
+        done = task.completed - task.fields.get("begun", 0)
+        if not done or not task.total or task.elapsed is None:
+            return Text("")
+        left = task.elapsed / done * (task.total - task.completed)
+        return Text(f"about {duration(left)} left", style="dim")
+
+
+def round_line(round: Round[Any]) -> Text:
+    """One round in one line: what matters most first."""
+    m = round.metrics
+    parts = [
+        Text(f"round {round.number:>3}", style="bold"),
+        Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue"),
+        Text(f"learned {m.get('evaluate/learned', float('nan')):>8.3g}", style="yellow"),
+    ]
+    for key, label, form in (
+        ("fit/accuracy_held_out", "accuracy", ".2f"),
+        ("evaluate/kl", "kl", ".2f"),
+        ("evaluate/fluency", "fluency", ".2f"),
+        ("label/answered", "labels", ".0f"),
+        ("steps/learn", "steps", ",.0f"),
+    ):
+        if key in m:
+            parts.append(Text(f"{label} {m[key]:{form}}"))
+    seconds = sum(v for k, v in m.items() if k.startswith("seconds/"))
+    return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
+
+
+def summary_table(summary: Mapping[str, Any]) -> Table:
+    """`summary.json` for people."""
+    table = Table(title=f"{summary['task']} ({summary['kind']}), seed {summary['seed']}", show_header=False, box=None)
+    gold = f"{number(summary['gold_before'])} → {number(summary['gold_after'])} (best {number(summary['gold_best'])})"
+    table.add_row("gold", Text(gold, style="bold blue"))
+    table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
+    if summary["kind"] == "text":
+        table.add_row("kl to the start, nats", number(summary["kl"]))
+        table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
+    for name in ("labels", "steps"):
+        table.add_row(name, ", ".join(f"{k} {v:,}" for k, v in summary[name].items()))
+    table.add_row("time", ", ".join(f"{k} {duration(v)}" for k, v in summary["seconds"].items()))
+    return table
+
+
+def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
+    """Names and numbers."""
+    return table(title, ("metric", "value"), [(name, number(value)) for name, value in metrics.items()])
+
+
+def table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
+    """A plain table; cells are text, never markup."""
+    made = Table(title=title, title_justify="left")
+    for column in columns:
+        made.add_column(column, overflow="fold")
+    for row in rows:
+        made.add_row(*(Text(cell) for cell in row))
+    return made
+
+
+def number(value: float | None) -> str:
+    return "—" if value is None else f"{value:.4g}"
+
+
+def duration(seconds: float) -> str:
+    """4.2 s, 3 min 05 s, 2 h 10 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

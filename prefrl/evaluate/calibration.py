@@ -1,0 +1,53 @@
+"""Does the reward model know how sure it may be? The bins of a reliability diagram."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from prefrl.types import Floats
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Held-out comparisons of similar confidence."""
+
+    count: int
+    confidence: float
+    """Mean predicted probability of the favourite, in [0.5, 1]."""
+    share: float
+    """How often the favourite was preferred; a tie counts half."""
+    low: float
+    high: float
+    """The 95 % Wilson interval of the share."""
+
+
+def reliability(predicted: Floats, preference: Floats, bins: int = 5) -> tuple[Bin, ...]:
+    """Compare predictions (M,) with preferences (M,), both in [0, 1]; only bins with comparisons in them.
+
+    Which candidate comes first is arbitrary, so each comparison is turned round to have its favourite first and
+    the bins divide [0.5, 1] evenly (Guo et al. 2017, section 2, on the folded probability).
+    """
+    if predicted.ndim != 1 or predicted.shape != preference.shape:
+        raise ValueError(f"reliability needs two equal rows of numbers, got {predicted.shape} and {preference.shape}")
+    turned = predicted < 0.5
+    confidence = np.where(turned, 1.0 - predicted, predicted).astype(np.float64)
+    won = np.where(turned, 1.0 - preference, preference).astype(np.float64)
+    place = np.minimum((confidence - 0.5) * 2 * bins, bins - 1).astype(int)
+    return tuple(_bin(confidence[place == i], won[place == i]) for i in range(bins) if (place == i).any())
+
+
+def _bin(confidence: Floats, won: Floats) -> Bin:
+    share = float(won.mean())
+    low, high = wilson(share, len(won))
+    return Bin(len(won), float(confidence.mean()), share, low, high)
+
+
+def wilson(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
+    """The interval of a proportion (Wilson 1927); honest for small counts, unlike share +- z x error."""
+    centre = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    scale = 1 + z * z / count
+    return (centre - half) / scale, (centre + half) / scale

@@ -1,0 +1,194 @@
+"""Figures as inline SVG. Colours are names of the page's CSS variables, so that one figure serves light and dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+
+from prefrl.evaluate.calibration import Bin
+
+Series: TypeAlias = Sequence[float | None]
+STAGES = ("sample", "label", "fit", "improve", "evaluate")
+COLOURS = {
+    name: f"#0101{i:02x}"
+    for i, name in enumerate(("ink", "muted", "rule", "card", "gold", "learned", *STAGES), start=1)
+}
+"""Stand-ins that matplotlib can draw with; `_svg` puts `var(--name)` in their place."""
+STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "font.size": 10.5,
+    "axes.edgecolor": COLOURS["rule"],
+    "axes.labelcolor": COLOURS["muted"],
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "axes.formatter.use_mathtext": False,
+    "axes.formatter.limits": (-4, 6),
+    "grid.color": COLOURS["rule"],
+    "grid.linewidth": 0.6,
+    "xtick.color": COLOURS["rule"],
+    "ytick.color": COLOURS["rule"],
+    "xtick.labelcolor": COLOURS["muted"],
+    "ytick.labelcolor": COLOURS["muted"],
+    "text.color": COLOURS["ink"],
+    "legend.frameon": False,
+    "legend.fontsize": 9.5,
+    "lines.linewidth": 2.2,
+    "lines.solid_capstyle": "round",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve over the rounds."""
+
+    values: Series
+    colour: str
+    """A name in `COLOURS`."""
+    label: str = ""
+    dash: str = "-"
+    spread: Series = ()
+    """Half the height of a band around the curve, or nothing."""
+
+
+def lines(
+    name: str, rounds: Sequence[int], curves: Sequence[Line], percent: bool = False, zero: bool = False
+) -> Markup:
+    """Curves over the rounds; empty when no curve has a value. `zero` starts the axis at 0, `percent` ends it at 1."""
+    drawn = [curve for curve in curves if any(value is not None for value in curve.values)]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        for curve in drawn:
+            _curve(axes, np.array(rounds), curve)
+        if max(abs(value) for curve in drawn for value in curve.values if value is not None) >= 10_000:
+            axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+        if percent:
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+            axes.set_ylim(top=1.02)
+        if zero:
+            axes.set_ylim(bottom=0)
+        _rounds_axis(axes)
+        _legend(axes, len(drawn))
+
+    return _svg(name, draw) if drawn else Markup("")
+
+
+def path(name: str, x: Series, y: Series, labels: tuple[str, str]) -> Markup:
+    """One metric against another, round by round, from a hollow dot to a full one; empty with under two points."""
+    points = np.array([(a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None])
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.plot(points[:, 0], points[:, 1], color=COLOURS["muted"], linewidth=1.2, alpha=0.6)
+        axes.scatter(points[1:-1, 0], points[1:-1, 1], s=16, color=COLOURS["muted"], linewidths=0)
+        ends = {"start": (points[0], COLOURS["card"]), "end": (points[-1], COLOURS["gold"])}
+        for label, (point, fill) in ends.items():
+            axes.scatter(
+                point[0], point[1], s=60, color=fill, edgecolors=COLOURS["gold"], linewidths=2, zorder=3, label=label
+            )
+        axes.margins(0.08)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+        _legend(axes, 2)
+
+    return _svg(name, draw) if len(points) > 1 else Markup("")
+
+
+def reliability(name: str, bins: Sequence[Bin]) -> Markup:
+    """Share of favourites preferred against the model's confidence, with intervals, over counts; empty without bins."""
+    x = np.array([b.confidence for b in bins])
+    y = np.array([b.share for b in bins])
+
+    def draw(figure: Figure) -> None:
+        axes, counts = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+        axes.plot([0.5, 1], [0.5, 1], color=COLOURS["muted"], linewidth=1.2, linestyle=(0, (4, 3)), label="perfect")
+        axes.vlines(x, [b.low for b in bins], [b.high for b in bins], color=COLOURS["learned"], linewidth=1.4)
+        axes.plot(x, y, "o", color=COLOURS["learned"], label="reward model")
+        axes.set_ylim(-0.03, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        _legend(axes, 2)
+        counts.bar(x, [b.count for b in bins], width=0.05, color=COLOURS["learned"], alpha=0.45)
+        for b in bins:
+            counts.annotate(str(b.count), (b.confidence, b.count), (0, 1.5), textcoords="offset points", ha="center")
+        counts.set_ylim(0, 1.9 * max(b.count for b in bins))
+        counts.set_yticks([])
+        counts.spines["left"].set_visible(False)
+        counts.grid(visible=False)
+        counts.set_xlim(0.47, 1.03)
+        counts.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        counts.set_xlabel("confidence in the favourite")
+
+    return _svg(name, draw) if bins else Markup("")
+
+
+def stacked(name: str, rounds: Sequence[int], seconds: Mapping[str, Series]) -> Markup:
+    """Seconds of each round, a stage on top of the other; empty when nothing was timed."""
+    heights = {stage: np.array([value or 0.0 for value in seconds[stage]]) for stage in STAGES}
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        floor = np.zeros(len(rounds))
+        for stage, height in heights.items():
+            axes.bar(rounds, height, 0.82, bottom=floor, color=COLOURS[stage], label=stage)
+            floor = floor + height
+        axes.grid(visible=False, axis="x")
+        _rounds_axis(axes)
+
+    return _svg(name, draw) if any(height.any() for height in heights.values()) else Markup("")
+
+
+def _curve(axes: Axes, rounds: np.ndarray, curve: Line) -> None:
+    values = np.array([np.nan if value is None else value for value in curve.values])
+    there = ~np.isnan(values)
+    x, y = rounds[there], values[there]
+    colour = COLOURS[curve.colour]
+    if curve.spread:
+        spread = np.array([0.0 if value is None else value for value in curve.spread])[there]
+        axes.fill_between(x, y - spread, y + spread, color=colour, alpha=0.16, linewidth=0)
+    dots = "o" if len(x) == 1 or (curve.dash == "-" and len(x) <= 25) else ""
+    axes.plot(x, y, curve.dash, color=colour, label=curve.label, marker=dots, markersize=4)
+
+
+def _rounds_axis(axes: Axes) -> None:
+    axes.set_xlabel("round")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7, min_n_ticks=1))
+
+
+def _legend(axes: Axes, entries: int) -> None:
+    """Above the axes, where it hides nothing."""
+    if entries > 1:
+        axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.98), ncols=entries, handlelength=1.4, borderaxespad=0)
+
+
+def _svg(name: str, draw: Callable[[Figure], None]) -> Markup:
+    """Draw into a figure 4.4 inches wide and give its <svg>, with ids of its own and the page's colours."""
+    buffer = io.StringIO()
+    style: Any = STYLE | {"svg.hashsalt": name}
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(4.4, 2.7), layout="constrained", facecolor="none")
+        draw(figure)
+        for axes in figure.axes:
+            axes.set_facecolor("none")
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'<svg ([^>]*?)width="[^"]*"', r'<svg aria-hidden="true" \1', text, count=1)
+    text = re.sub(r'(<svg [^>]*?)height="[^"]*"', r"\1", text, count=1)
+    for colour, stand_in in COLOURS.items():
+        text = text.replace(stand_in, f"var(--{colour})")
+    return Markup(text)

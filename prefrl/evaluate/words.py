@@ -1,0 +1,79 @@
+"""The run in words, and its numbers as people read them."""
+
+from __future__ import annotations
+
+from prefrl.evaluate.facts import Facts
+
+
+def headline(facts: Facts) -> str:
+    """What happened, in one plain sentence."""
+    start = f"{show_count(facts.rounds, 'round')}"
+    spent = [
+        show_count(facts.labels["answered"], "label") if facts.labels["answered"] is not None else "",
+        show_count(sum(v or 0 for v in facts.steps.values()), _unit(facts.kind)) if any(facts.steps.values()) else "",
+        show_time(facts.total_seconds) if facts.total_seconds else "",
+    ]
+    cost = ", ".join(word for word in spent if word)
+    took = f"{'in' if facts.finished else 'so far, in'} {start}" + (f" ({cost})" if cost else "")
+    before, after, _ = facts.gold
+    if before is None or after is None:
+        return f"There is no gold to tell whether it helped, {took}." if facts.rounds else "No round is over yet."
+    words = f"from {show_number(before, after)} to {show_number(after, before)}"
+    if after == before:
+        return f"Gold stayed at {show_number(after)} {took}."
+    return f"Gold {'rose' if after > before else 'fell'} {words} {took}."
+
+
+def verdict(facts: Facts) -> str:
+    """What to think of it: worse, within the spread, past its best, less fluent."""
+    before, after, best = facts.gold
+    remarks = []
+    if before is not None and after is not None:
+        spreads = [value for value in facts.gold_spread if value is not None]
+        if after < before:
+            remarks.append("The policy got worse.")
+        if after != before and spreads and abs(after - before) < min(spreads):
+            remarks.append("The change is smaller than one standard deviation between episodes.")
+        if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
+            remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
+    start, end = facts.fluency
+    if start is not None and end is not None:
+        change = "fell" if end < start else "rose" if end > start else "stayed"
+        remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
+    return " ".join(remarks)
+
+
+def _unit(kind: str) -> str:
+    return "generated token" if kind == "text" else "environment step"
+
+
+def show_number(value: float | None, beside: float | None = None) -> str:
+    """Three or so significant digits, those of the larger one when beside another; a dash for what is not known."""
+    if value is None:
+        return "–"
+    size = max(abs(value), abs(beside or 0.0))
+    if size and (size < 0.001 or size >= 1e9):
+        return f"{value:.1e}".replace("-", "−")
+    digits = 0 if size >= 100 or not size else 1 if size >= 10 else 2 if size >= 0.1 else 3
+    return f"{value:,.{digits}f}".replace("-", "−")
+
+
+def show_share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f}\N{NO-BREAK SPACE}%".replace("-", "−")
+
+
+def show_time(seconds: float | None) -> str:
+    if seconds is None:
+        return "–"
+    if seconds < 0.95:
+        return f"{1000 * seconds:.0f} ms"
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def show_count(count: int | None, what: str = "") -> str:
+    shown = "–" if count is None else f"{count:,}"
+    return f"{shown} {what}{'' if count == 1 else 's'}" if what else shown

@@ -1,0 +1,84 @@
+"""`prefrl describe`: a component's settings, what they mean, and what a learner optimises, as a formula."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.padding import Padding
+from rich.text import Text
+
+from prefrl.components import TABLE, ConfigError, Role, Settings, kinds, settings_class, suggest
+from prefrl.config import Config, presets
+from prefrl.console import table
+from prefrl.fit.trainer import FittingSettings
+from prefrl.loop import LoopSettings
+
+ALWAYS: dict[str, type[Settings]] = {"fitting": FittingSettings, "loop": LoopSettings}
+SIGNS = {Ge: "≥", Gt: ">", Le: "≤", Lt: "<"}
+
+
+def explain(name: str | None) -> list[RenderableType]:
+    """What a person reads about a kind or a preset; without a name, the kinds there are."""
+    if name is None:
+        rows = [(role[:-1], ", ".join(kinds(role))) for role in TABLE]
+        return [table("kinds: prefrl describe KIND", ("role", "kinds"), [*rows, ("always there", ", ".join(ALWAYS))])]
+    if name in presets():
+        config = Config.load(name)
+        return [Text(config.dump()), *_formula(config.learner)]
+    if name in ALWAYS:
+        return _component(name, ALWAYS[name])
+    roles: list[Role] = [role for role in TABLE if name in kinds(role)]
+    if not roles:
+        known = [*ALWAYS, *(kind for role in TABLE for kind in kinds(role)), *presets()]
+        raise ConfigError(f"nothing is called {name!r}; {suggest(name, known)}")
+    return [part for role in roles for part in _component(f"{role[:-1]} kind {name}", settings_class(role, name))]
+
+
+def _component(title: str, cls: type[Settings]) -> list[RenderableType]:
+    rows = [(name, _type(field), _default(field), field.description or "") for name, field in cls.model_fields.items()]
+    intro = Text((cls.__doc__ or "").strip())
+    shown = table(title, ("setting", "type", "default", "meaning"), rows)
+    return [intro, Text(), shown, *(_formula(cls()) if _has_defaults(cls) else [])]
+
+
+def _formula(settings: Settings) -> list[RenderableType]:
+    """The objective, of learners that can spell it out."""
+    formula: Any = getattr(settings, "formula", None)
+    return [Text("\nwhat it optimises", style="bold"), Padding(escape(formula()), (0, 2))] if formula else []
+
+
+def _has_defaults(cls: type[Settings]) -> bool:
+    return not any(field.is_required() for field in cls.model_fields.values())
+
+
+def _type(field: FieldInfo) -> str:
+    """The type in words, with its bounds."""
+    annotation: Any = field.annotation
+    choices = get_args(annotation)
+    name = getattr(annotation, "__name__", None) if not choices else " | ".join(_plain(c) for c in choices)
+    bounds = [f"{SIGNS[type(m)]} {next(iter(vars_of(m)))}" for m in field.metadata if type(m) in SIGNS]
+    return ", ".join([name or str(annotation), *bounds])
+
+
+def vars_of(bound: Any) -> list[Any]:
+    """The one number that a bound holds."""
+    return [getattr(bound, name) for name in ("ge", "gt", "le", "lt") if hasattr(bound, name)]
+
+
+def _plain(choice: Any) -> str:
+    if choice is type(None):
+        return "null"
+    return getattr(choice, "__name__", None) or str(choice)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.default_factory is not None:
+        return "..."
+    if field.default is PydanticUndefined:
+        return "required"
+    return "null" if field.default is None else str(field.default)

@@ -1,0 +1,158 @@
+"""A small policy and its critic: two MLPs behind one observation normaliser, a Gaussian or a categorical head."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from prefrl.improve.objectives import categorical_entropy
+from prefrl.protocols import ControlTask
+from prefrl.seeding import draw_seed
+from prefrl.types import Floats, State
+
+CLIP = 10.0
+"""Normalised observations are clipped to this many standard deviations."""
+
+
+@dataclass(frozen=True)
+class ActionSpace:
+    """How a policy's choices become actions: one-hot, or the bounds' box scaled to [-1, 1] and clipped."""
+
+    size: int
+    middle: Floats | None = None
+    """(A,), None where actions are discrete."""
+    half: Floats | None = None
+    clip: Floats | None = None
+    """(A,): 1 where there are bounds, infinity elsewhere."""
+
+    @classmethod
+    def of(cls, task: ControlTask) -> ActionSpace:
+        if task.action_bounds is None:
+            return cls(task.action_size)
+        low, high = (np.asarray(b, np.float32) for b in task.action_bounds)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        middle = np.where(bounded, (low + high) / 2, 0).astype(np.float32)
+        half = np.where(bounded, (high - low) / 2, 1).astype(np.float32)
+        return cls(task.action_size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
+
+    @property
+    def discrete(self) -> bool:
+        return self.middle is None
+
+    def execute(self, choices: Floats) -> Floats:
+        """(..., A) -> (..., A): what the environment is given."""
+        if self.middle is None or self.half is None or self.clip is None:
+            return choices
+        return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
+
+
+class Policy:
+    """An actor and a critic, each an MLP with tanh; state-independent log standard deviation for boxes.
+
+    Weights are orthogonal with gains sqrt(2), 0.01 for the actor's last layer and 1 for the critic's. Acting is
+    NumPy on the same weights: for networks this small torch's overhead would be most of the time.
+    """
+
+    def __init__(self, task: ControlTask, hidden: tuple[int, ...], initial_std: float, rng: np.random.Generator):
+        self.space = ActionSpace.of(task)
+        generator = torch.Generator().manual_seed(draw_seed(rng))
+        size = task.observation_size
+        self.actor = _mlp((size, *hidden, task.action_size), 0.01, generator)
+        self.critic = _mlp((size, *hidden, 1), 1.0, generator)
+        self.log_std = torch.nn.Parameter(torch.full((task.action_size,), math.log(initial_std)))
+        self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
+
+    def actor_parameters(self) -> list[torch.nn.Parameter]:
+        return [*self.actor, *([] if self.space.discrete else [self.log_std])]
+
+    def normalise(self, observations: Floats) -> Floats:
+        """(..., O) -> (..., O) float32, by the statistics so far."""
+        scaled = (observations - self._mean32) * self._scale32
+        return np.clip(scaled, -CLIP, CLIP, out=scaled)
+
+    @property
+    def _mean32(self) -> Floats:
+        return self.mean.astype(np.float32)
+
+    @property
+    def _scale32(self) -> Floats:
+        return (1.0 / np.sqrt(self.variance + 1e-8)).astype(np.float32)
+
+    def observe(self, observations: Floats) -> None:
+        """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979). Not between acting and learning."""
+        new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
+        total = self.count + len(new)
+        delta = new.mean(0) - self.mean
+        squares = self.variance * self.count + new.var(0) * len(new) + delta**2 * self.count * len(new) / total
+        self.mean = self.mean + delta * len(new) / total
+        self.variance, self.count = squares / total, total
+
+    def act(self, observations: Floats, rng: np.random.Generator | None) -> tuple[Floats, Floats]:
+        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None."""
+        outputs = self._actor_numpy(self.normalise(observations))
+        if self.space.discrete:
+            noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
+            choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
+            return choices, choices
+        if rng is not None:
+            std = np.exp(self.log_std.detach().numpy())
+            outputs = outputs + std * rng.standard_normal(outputs.shape, np.float32)
+        return outputs, self.space.execute(outputs)
+
+    def log_prob(self, inputs: Tensor, choices: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised observations (B, O) and choices (B, A) -> log probabilities (B,) and entropies (B,), in nats."""
+        outputs = forward(self.actor, inputs)
+        if self.space.discrete:
+            return (outputs.log_softmax(-1) * choices).sum(-1), categorical_entropy(outputs)
+        scaled = (choices - outputs) * (-self.log_std).exp()
+        constant = self.log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
+        entropy = constant + 0.5 * self.space.size
+        return -0.5 * (scaled**2).sum(-1) - constant, entropy.expand(len(inputs))
+
+    def values(self, inputs: Tensor) -> Tensor:
+        """Normalised observations (..., O) -> (...)."""
+        return forward(self.critic, inputs).squeeze(-1)
+
+    def state(self) -> State:
+        named = {name: p.detach().clone() for name, p in self._named()}
+        return {"parameters": named, "mean": self.mean, "variance": self.variance, "count": self.count}
+
+    def load(self, state: State) -> None:
+        """Raises ValueError where shapes differ."""
+        for name, parameter in self._named():
+            if state["parameters"][name].shape != parameter.shape:
+                found, expected = tuple(state["parameters"][name].shape), tuple(parameter.shape)
+                raise ValueError(f"policy: {name} has shape {found}, expected {expected}: other settings or task")
+            parameter.data.copy_(state["parameters"][name])
+        self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
+
+    def _named(self) -> list[tuple[str, torch.nn.Parameter]]:
+        nets = [(f"actor_{i}", p) for i, p in enumerate(self.actor)]
+        return nets + [(f"critic_{i}", p) for i, p in enumerate(self.critic)] + [("log_std", self.log_std)]
+
+    def _actor_numpy(self, x: Floats) -> Floats:
+        arrays = [p.detach().numpy() for p in self.actor]
+        for i in range(0, len(arrays) - 2, 2):
+            x = np.tanh(x @ arrays[i].T + arrays[i + 1])
+        out: Floats = x @ arrays[-2].T + arrays[-1]
+        return out
+
+
+def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:
+    """An MLP given as [weight, bias, weight, bias, ...], tanh between layers."""
+    for i in range(0, len(net) - 2, 2):
+        x = torch.tanh(torch.nn.functional.linear(x, net[i], net[i + 1]))
+    return torch.nn.functional.linear(x, net[-2], net[-1])
+
+
+def _mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> list[torch.nn.Parameter]:
+    net = []
+    for i, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        gain = last_gain if i == len(sizes) - 2 else math.sqrt(2)
+        weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, generator)
+        net += [torch.nn.Parameter(weight), torch.nn.Parameter(torch.zeros(fan_out))]
+    return net

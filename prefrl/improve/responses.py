@@ -1,0 +1,128 @@
+"""Responses as tensors: sampled once, scored by forward passes, never decoded and encoded again in between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor
+from transformers import PreTrainedModel, PreTrainedTokenizerBase
+
+from prefrl.components import ConfigError
+from prefrl.improve.generate import Sampling, generate
+from prefrl.protocols import Task, TextTask
+from prefrl.types import Response
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """B responses, K to each prompt, all of the first prompt first."""
+
+    prompts: tuple[str, ...]
+    """Each row's own."""
+    prompt_tokens: tuple[tuple[int, ...], ...]
+    tokens: Tensor
+    """(B, L) int64, right-padded."""
+    mask: Tensor
+    """(B, L) bool: the real tokens, the end token included."""
+    logp: Tensor
+    """(B, L) float32: log-probabilities at sampling; 0 on padding."""
+    ended: Tensor
+    """(B,) bool: whether there is an end token."""
+
+    def __len__(self) -> int:
+        return len(self.prompts)
+
+    @property
+    def count(self) -> int:
+        """How many tokens were generated."""
+        return int(self.mask.sum())
+
+    def rows(self, at: Tensor) -> Responses:
+        """Some rows, cut to the longest of them."""
+        width = int(self.mask[at].sum(1).max())
+        tokens, mask, logp = (x[at, :width] for x in (self.tokens, self.mask, self.logp))
+        chosen = [int(i) for i in at]
+        prompts, prompt_tokens = tuple(self.prompts[i] for i in chosen), tuple(self.prompt_tokens[i] for i in chosen)
+        return Responses(prompts, prompt_tokens, tokens, mask, logp, self.ended[at])
+
+    def chunks(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
+        """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
+        lengths = self.mask.sum(1) + torch.tensor([len(p) for p in self.prompt_tokens])
+        for at in lengths.argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
+            yield at, self.rows(at)
+
+    def candidates(self, tokenizer: PreTrainedTokenizerBase) -> list[Response]:
+        """The same as the vocabulary's `Response`s, without gold."""
+        found = []
+        for i, prompt in enumerate(self.prompts):
+            tokens = self.tokens[i, self.mask[i]].tolist()
+            text = str(tokenizer.decode(tokens, skip_special_tokens=True))
+            found.append(Response(prompt, text, self.prompt_tokens[i], tuple(tokens)))
+        return found
+
+
+def respond(
+    model: PreTrainedModel, task: TextTask, prompts: Sequence[str], sampling: Sampling, generator: torch.Generator
+) -> Responses:
+    """Sample K responses to each prompt; prompts are encoded here, once, with the tokenizer's own begin token."""
+    encoded = [tuple(task.tokenizer.encode(prompt)) for prompt in prompts]
+    drawn = generate(model, encoded, sampling, generator)
+    repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(sampling.samples)]
+    texts, ids = zip(*repeated, strict=True)
+    return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
+
+
+def response_logp(model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
+    """(B, L) float32 log-probabilities of the responses' tokens, differentiable; 0 on padding.
+
+    Rows are padded on the right, where a causal model never looks: no attention mask and no position ids are needed.
+    The head runs on the real tokens of the responses only.
+    """
+    lengths = torch.tensor([len(p) for p in responses.prompt_tokens])
+    rows, steps = responses.mask.nonzero(as_tuple=True)
+    places = lengths[rows] + steps
+    ids = torch.zeros(len(responses), int(places.max()) + 1, dtype=torch.int64)
+    for row, prompt in zip(ids, responses.prompt_tokens, strict=True):
+        row[: len(prompt)] = torch.tensor(prompt)
+    chosen = responses.tokens[rows, steps]
+    ids[rows, places] = chosen
+    hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
+    logits = head_logits(model, hidden[rows, places - 1])
+    found = -torch.nn.functional.cross_entropy(logits.float() / temperature, chosen, reduction="none")
+    return torch.zeros(responses.mask.shape).masked_scatter(responses.mask, found)
+
+
+@torch.no_grad()
+def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, chunk: int) -> Tensor:
+    """`response_logp` without gradients, a chunk of rows at a time."""
+    found = torch.zeros(responses.mask.shape)
+    for at, rows in responses.chunks(chunk):
+        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)
+    return found
+
+
+def head_logits(model: PreTrainedModel, hidden: Tensor) -> Tensor:
+    """The language model's head, on hidden states of any shape (..., d)."""
+    head = model.get_output_embeddings()  # type: ignore[no-untyped-call]
+    logits: Tensor = head(hidden)
+    return logits
+
+
+@torch.no_grad()
+def check_head(model: PreTrainedModel) -> None:
+    """Raise `ConfigError` for models whose logits are more than their head's output (soft caps, scales)."""
+    ids = torch.zeros(1, 4, dtype=torch.int64)
+    direct = model(input_ids=ids, use_cache=False).logits
+    ours = head_logits(model, model.base_model(input_ids=ids, use_cache=False).last_hidden_state)
+    if not torch.allclose(direct, ours, atol=1e-4, rtol=1e-4):
+        raise ConfigError(f"{type(model).__name__} does more to its logits than its head says; this is not supported")
+
+
+def text(task: Task, kind: str) -> TextTask:
+    """A task, known to be of text. Raises `ConfigError` for others."""
+    if task.kind != "text":
+        raise ConfigError(f"learner kind {kind!r} writes text, but the task is of kind {task.kind!r}")
+    return cast(TextTask, task)

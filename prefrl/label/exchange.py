@@ -1,0 +1,119 @@
+"""Judgements in and out of files: the columns that the field uses, and a bundle that loses nothing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from prefrl.files import verify, whole_folder, write_file
+from prefrl.log import StoreError
+from prefrl.store import Store
+from prefrl.types import Comparison, Query, Response, implied_pairs
+
+COLUMNS = ("prompt", "chosen", "rejected")
+SHOWN_ERRORS = 20
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What a file got, and what it could not hold."""
+
+    written: int
+    ties: int = 0
+
+
+def export_preferences(store: Store[Any], path: Path) -> Exported:
+    """Write one JSON object a line with `prompt`, `chosen`, `rejected`: every decided pair that the judgements imply.
+
+    Ties have no place in these columns; they are left out and counted. Raises `StoreError` for control segments.
+    """
+    lines, ties = [], 0
+    for judged in store.judged():
+        texts = judged.query.candidates
+        if not isinstance(texts[0], Response):
+            raise StoreError("preferences over control segments do not fit prompt/chosen/rejected; use --form bundle")
+        for i, j, preference in implied_pairs(judged.judgement):
+            ties += preference == 0.5
+            if preference != 0.5:
+                better, worse = (texts[i], texts[j]) if preference > 0.5 else (texts[j], texts[i])
+                row = dict(zip(COLUMNS, (texts[0].prompt, better.text, worse.text), strict=True))
+                lines.append(json.dumps(row, ensure_ascii=False) + "\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(lines), encoding="utf-8")
+    return Exported(len(lines), ties)
+
+
+def import_preferences(path: Path, store: Store[Response]) -> int:
+    """Read `prompt`, `chosen`, `rejected` lines into a store, all or none; returns the number of rows.
+
+    Raises `ValueError` with the number of each bad row (the first 20). A pair that comes again is another judgement
+    of the same query, by "file#2" and so on: contradictions are kept, not resolved.
+    """
+    rows, errors = [], []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+        try:
+            rows.append(_parse(line))
+        except ValueError as error:
+            errors.append(f"row {number}: {error}")
+    if errors:
+        more = f"\n... and {len(errors) - SHOWN_ERRORS} more" if len(errors) > SHOWN_ERRORS else ""
+        raise ValueError(f"{path}: nothing was imported\n" + "\n".join(errors[:SHOWN_ERRORS]) + more)
+    if not rows:
+        raise ValueError(f"{path}: expected at least one row of {', '.join(COLUMNS)}, got none")
+    seen: Counter[str] = Counter()
+    answers = []
+    for query, chosen in rows:
+        seen[query.id] += 1
+        labeler = "file" if seen[query.id] == 1 else f"file#{seen[query.id]}"
+        answers.append(Comparison(query.id, float(query.candidates[0].id == chosen), labeler))
+    store.ask([query for query, _ in rows])
+    store.answer(answers)
+    return len(rows)
+
+
+def _parse(line: str) -> tuple[Query[Response], str]:
+    """A row as a query and the id of the chosen response."""
+    row = json.loads(line, parse_constant=_no_constant)
+    if not isinstance(row, dict):
+        raise ValueError(f"expected an object, got {type(row).__name__}")
+    for name in COLUMNS:
+        if not isinstance(row.get(name), str):
+            raise ValueError(f"column {name!r}: expected a string, got {row.get(name, 'nothing')!r}")
+    if row["chosen"] == row["rejected"]:
+        raise ValueError("chosen and rejected are the same text")
+    chosen, rejected = (Response(row["prompt"], row[name]) for name in ("chosen", "rejected"))
+    return Query((chosen, rejected)), chosen.id
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a value")
+
+
+def export_bundle(store: Store[Any], path: Path) -> Exported:
+    """Write a folder with every event and every array, gold apart from the rest and left out. Loses nothing else."""
+    events = list(store.events())
+    with whole_folder(path) as work:
+        lines = "".join(json.dumps(event, ensure_ascii=False) + "\n" for event in events)
+        write_file(work / "events.jsonl", lines.encode())
+        for blob in sorted((store.folder / "blobs").rglob("*.safetensors")):
+            write_file(work / blob.relative_to(store.folder), blob.read_bytes())
+    return Exported(sum(event["kind"] in ("comparison", "ranking", "skip") for event in events))
+
+
+def import_bundle(path: Path, store: Store[Any]) -> int:
+    """Read a folder that `export_bundle` wrote, all or none; what the store has already is left alone."""
+    verify(path)
+    return store.merge(list(_events(path / "events.jsonl")), path / "blobs")
+
+
+def _events(path: Path) -> Iterator[dict[str, Any]]:
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            event = json.loads(line)
+            yield {name: event[name] for name in ("id", "kind", "subject", "actor", "body", "at")}
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: row {number} is no event: {error!r}") from None

@@ -1,0 +1,143 @@
+"""The loop: sample behaviours, ask and label, fit a reward model, improve the policy, evaluate, again.
+
+It knows nothing of control or text: what is particular is in the task and the learner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Generic
+
+from pydantic import Field
+
+from prefrl.components import Settings
+from prefrl.fit.trainer import FittingSettings, NothingToFit, fit
+from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
+from prefrl.seeding import Streams, streams
+from prefrl.types import C, Evaluation, Fitted, Metrics, Round
+
+
+class LoopSettings(Settings):
+    """How often, and how much is asked."""
+
+    rounds: int = Field(10, ge=1)
+    labels: int = Field(200, ge=0)
+    """Queries asked in all rounds together; skipped ones count, they cost a person's time too.
+
+    With 0 the loop only improves and evaluates: for a reward model that was fitted before.
+    """
+    first_share: float = Field(0.25, gt=0, le=1)
+    """The share of the labels that is asked in the first round; the rest is spread evenly over the others."""
+    pool: float = Field(4.0, ge=1)
+    """Candidates sampled for each one that is asked about, for the selector to choose from."""
+
+    def shrunk(self) -> LoopSettings:
+        return self.model_copy(update={"rounds": 1, "labels": min(self.labels, 8)})
+
+    def asked_by(self, round: int) -> int:
+        """How many labels have been asked for at the end of a round."""
+        if round == 0 or self.rounds == 1:
+            return self.labels * round
+        rest = (1 - self.first_share) * (round - 1) / (self.rounds - 1)
+        return round_half_up(self.labels * (self.first_share + rest))
+
+
+@dataclass
+class Loop(Generic[C]):
+    """Everything that takes part, and where it stands.
+
+    `for round in loop.run(): ...` runs it; printing, plotting, saving and stopping are the caller's.
+    """
+
+    task: Task
+    learner: Learner[C]
+    reward: RewardModel[C]
+    labeler: Labeler[C]
+    selector: Selector[C]
+    store: Store[C]
+    candidates: int
+    """K: how many candidates a query puts side by side."""
+    fitting: FittingSettings
+    settings: LoopSettings
+    seed: int = 0
+    round: int = -1
+    """The last round that is done; 0 is the evaluation of the starting policy, -1 is nothing yet."""
+    stage: str = "start"
+    """What is going on, for whoever watches."""
+    _seconds: Metrics = field(default_factory=dict)
+
+    def run(self) -> Iterator[Round[C]]:
+        """Go on from where the loop stands to the last round."""
+        while self.round < self.settings.rounds:
+            yield self.step() if self.round >= 0 else self.start()
+
+    def start(self) -> Round[C]:
+        """Round 0: how good is the starting policy?"""
+        evaluated = self._evaluate(streams(self.seed, 0))
+        return self._finish(0, {}, evaluated, None)
+
+    def step(self) -> Round[C]:
+        """One turn of the loop: the five stages, in order."""
+        number = self.round + 1
+        rng = streams(self.seed, number)
+        self._ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
+        with self._timed("label"):
+            self.labeler.answer(self.store, rng.label)
+        fitted = self._fit(rng)
+        improved: Metrics = {}
+        if self.reward.fitted:
+            with self._timed("improve"):
+                improved = self.learner.improve(self.reward, self.store, rng.improve)
+        return self._finish(number, improved, self._evaluate(rng), fitted)
+
+    def _ask(self, count: int, rng: Streams) -> None:
+        """Sample a pool, and ask about the part of it that is worth a label."""
+        if count <= 0:
+            return
+        with self._timed("sample"):
+            pool = self.learner.sample(int(count * self.candidates * self.settings.pool), rng.sample)
+            queries = self.selector.select(pool, self.reward, count, rng.select)
+            if len(queries) < count:
+                raise ValueError(
+                    f"{count} queries of {self.candidates} were wanted, but {len(pool)} sampled candidates gave only "
+                    f"{len(queries)}: raise loop.pool (now {self.settings.pool}) or lower loop.labels"
+                )
+            self.store.ask(queries)
+
+    def _fit(self, rng: Streams) -> Fitted | None:
+        with self._timed("fit"):
+            try:
+                return fit(self.reward, self.store, self.fitting, rng.fit)
+            except NothingToFit:  # people may not have answered yet: what is known stays, the next round asks again
+                return None
+
+    def _evaluate(self, rng: Streams) -> Evaluation[C]:
+        with self._timed("evaluate"):
+            return self.learner.evaluate(self.reward, rng.evaluate)
+
+    def _finish(self, number: int, improved: Metrics, evaluated: Evaluation[C], fitted: Fitted | None) -> Round[C]:
+        """Gather the round's numbers, and count it as done."""
+        stages: dict[str, Metrics] = {
+            "label": {name: float(n) for name, n in self.store.counts().items()},
+            "fit": fitted.metrics if fitted else {},
+            "improve": improved,
+            "evaluate": evaluated.metrics,
+            "steps": {name: float(n) for name, n in self.learner.steps._asdict().items()},
+            "seconds": self._seconds,
+        }
+        self.round, self._seconds, self.stage = number, {}, "idle"
+        metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
+        return Round(number, metrics, evaluated.examples, fitted)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        self.stage, begin = stage, perf_counter()
+        yield
+        self._seconds[stage] = perf_counter() - begin
+
+
+def round_half_up(x: float) -> int:
+    return int(x + 0.5)

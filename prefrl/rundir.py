@@ -1,0 +1,219 @@
+"""A run's folder: settings, metrics, checkpoints, report. A killed run goes on from its newest good checkpoint."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prefrl.checkpoints import load_state, save_state
+from prefrl.config import Config
+from prefrl.evaluate.examples import save_examples
+from prefrl.evaluate.report import write_report
+from prefrl.evaluate.summary import read_metrics, summarise
+from prefrl.files import DamagedError, verify, whole_folder, write_file
+from prefrl.loop import Loop
+from prefrl.protocols import RewardModel, Task
+from prefrl.seeding import streams
+from prefrl.store import Store
+from prefrl.types import Round
+
+KEEP = 2
+"""Checkpoints kept: if the newest is damaged, the one before it serves."""
+
+
+class RunError(ValueError):
+    """A folder does not hold the run that was expected."""
+
+
+class Run:
+    """A run in its folder. Iterate over it: each round is on disk before it is yielded.
+
+    A folder with the same settings is taken up where it stopped; one with other settings is refused.
+    """
+
+    def __init__(self, config: Config, folder: str | Path, reward: Path | None = None) -> None:
+        """Make or reopen the folder and build everything in it. `reward`: start from the reward model saved there."""
+        self.config, self.folder = config, Path(folder)
+        self.notes: list[str] = []
+        """What a person should know about the start: from where it goes on, which checkpoints were damaged."""
+        _claim(config, self.folder)
+        self.store: Store[Any] = Store(self.folder)
+        try:
+            self.loop: Loop[Any] = config.build(self.store)
+            if reward is not None:
+                self.loop.reward.load(load_state(_newest(reward)[0], "reward"))
+            self._rows = self._restore()
+            self._events = _events(self.folder, self.loop.round)
+        except BaseException:
+            self.store.close()
+            raise
+
+    @classmethod
+    def resume(cls, folder: str | Path) -> Run:
+        """Reopen a run by its folder alone."""
+        return cls(saved_config(Path(folder)), folder)
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._events.close()
+        self.store.close()
+
+    def __iter__(self) -> Iterator[Round[Any]]:
+        for round in self.loop.run():
+            self._record(round)
+            yield round
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What came out, as in `summary.json`."""
+        return summarise(self._rows, self.loop.task, self.config.seed)
+
+    def report(self) -> Path:
+        """Write `report.html`, and say where it is."""
+        return write_report(self.folder)
+
+    def _record(self, round: Round[Any]) -> None:
+        """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""
+        row = {"round": round.number} | {k: v if math.isfinite(v) else None for k, v in round.metrics.items()}
+        self._rows.append(row)
+        write_file(self.folder / "metrics.jsonl", "".join(json.dumps(r) + "\n" for r in self._rows).encode())
+        write_file(self.folder / "summary.json", json.dumps(self.summary, indent=1).encode())
+        if round.fitted is not None and len(round.fitted.predicted):
+            pairs = {"predicted": round.fitted.predicted.tolist(), "preference": round.fitted.preference.tolist()}
+            write_file(self.folder / "held_out.json", json.dumps({"round": round.number} | pairs).encode())
+        self._save_examples(round)
+        for name, value in round.metrics.items():
+            self._events.add_scalar(name, value, round.number)
+        self._checkpoint(round.number)
+
+    def _save_examples(self, round: Round[Any]) -> None:
+        """A few candidates to look at, of the starting policy and of the newest one."""
+        reward, examples = self.loop.reward, list(round.examples)
+        learned = reward.score(examples) if reward.fitted and examples else np.full(len(examples), np.nan)
+        name = "after" if round.number else "before"
+        save_examples(self.loop.task, examples, learned, self.folder, name)
+
+    def _checkpoint(self, number: int) -> None:
+        with whole_folder(self.folder / "checkpoints" / f"round-{number:04d}") as folder:
+            save_state(folder, "learner", self.loop.learner.state())
+            save_state(folder, "reward", self.loop.reward.state())
+            write_file(folder / "config.yaml", self.config.dump().encode())
+            write_file(folder / "loop.json", json.dumps({"round": number, "store": self.store.sequence}).encode())
+        for old in _checkpoints(self.folder)[KEEP:]:
+            shutil.rmtree(old)
+
+    def _restore(self) -> list[dict[str, Any]]:
+        """Load the newest good checkpoint, and the rows of metrics up to it."""
+        if not _checkpoints(self.folder):
+            return []
+        folder, damaged = _newest(self.folder)
+        self.notes += damaged
+        self.loop.learner.load(load_state(folder, "learner"))
+        self.loop.reward.load(load_state(folder, "reward"))
+        self.loop.round = json.loads((folder / "loop.json").read_text())["round"]
+        self.notes.append(f"going on after round {self.loop.round}")
+        return [row for row in read_metrics(self.folder) if row["round"] <= self.loop.round]
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a run or a single stage left in a folder."""
+
+    config: Config
+    folder: Path
+    """The checkpoint itself."""
+
+    def reward(self, task: Task) -> RewardModel[Any]:
+        """The reward model, on a task of the same kind."""
+        settings: Any = self.config.reward
+        model: RewardModel[Any] = settings.build(task, streams(self.config.seed, 0).build)
+        model.load(load_state(self.folder, "reward"))
+        return model
+
+
+def open_saved(path: str | Path) -> Saved:
+    """The newest good checkpoint of a run, or a folder that `save_reward` wrote. Raises `RunError`."""
+    folder = _newest(Path(path))[0]
+    return Saved(saved_config(folder), folder)
+
+
+def save_reward(folder: Path, config: Config, reward: RewardModel[Any]) -> None:
+    """Write a reward model with the settings that can build it again."""
+    with whole_folder(folder) as work:
+        save_state(work, "reward", reward.state())
+        write_file(work / "config.yaml", config.dump().encode())
+
+
+def saved_config(folder: Path) -> Config:
+    """The settings in a folder. Raises `RunError` where there are none."""
+    if not (folder / "config.yaml").is_file():
+        raise RunError(f"{folder} holds no run: expected a file config.yaml in it")
+    return Config.load(folder / "config.yaml")
+
+
+def _claim(config: Config, folder: Path) -> None:
+    """Make the folder for these settings, or see that it is for these settings already."""
+    path, wanted = folder / "config.yaml", config.dump()
+    if not path.exists():
+        strangers = [p.name for p in folder.iterdir() if p.name[0] != "."] if folder.exists() else []
+        if strangers:
+            raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
+        write_file(path, wanted.encode())
+    elif (found := Config.load(path)) != config:
+        raise RunError(
+            f"{folder} holds a run with other settings ({_difference(found, config)}): choose another folder"
+        )
+
+
+def _difference(a: Config, b: Config) -> str:
+    """The first setting in which two configs differ."""
+    flat_a, flat_b = (dict(_flatten(c.model_dump(mode="json"))) for c in (a, b))
+    key = next(k for k in [*flat_a, *flat_b] if flat_a.get(k) != flat_b.get(k))
+    return f"{key} is {flat_a.get(key)} there, {flat_b.get(key)} here"
+
+
+def _flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """Newest first."""
+    return sorted((p for p in folder.glob("checkpoints/round-*") if re.search(r"\d$", p.name)), reverse=True)
+
+
+def _newest(folder: Path) -> tuple[Path, list[str]]:
+    """The newest good checkpoint of a run (or the folder itself, if it is one), and what was wrong with newer ones."""
+    damaged = []
+    for checkpoint in _checkpoints(folder) or [folder]:
+        try:
+            verify(checkpoint)
+        except DamagedError as error:
+            damaged.append(str(error))
+        else:
+            return checkpoint, damaged
+    raise RunError(f"{folder} holds no checkpoint that can be used: {'; '.join(damaged)}")
+
+
+def _events(folder: Path, round: int) -> Any:
+    """TensorBoard's event files, beside the rest."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=round + 1)

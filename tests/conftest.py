@@ -1,0 +1,54 @@
+"""Small candidates and stores that many tests share."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from prefrl.store import Store
+from prefrl.types import Query, Response, Segment
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_thread() -> None:
+    """Tests compare bytes, and share two cores."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def make_segment(rng: np.random.Generator) -> Callable[..., Segment]:
+    """Segments of random numbers, each of an episode of its own."""
+    count = iter(range(10_000))
+
+    def make(steps: int = 5, gold: float | None = None) -> Segment:
+        observations = rng.normal(size=(steps, 3)).astype(np.float32)
+        actions = rng.normal(size=(steps, 2)).astype(np.float32)
+        hidden = None if gold is None else np.full(steps, gold / steps)
+        return Segment(observations, actions, episode=str(next(count)), start=0, gold=hidden)
+
+    return make
+
+
+@pytest.fixture
+def make_query(make_segment: Callable[..., Segment]) -> Callable[..., Query[Segment]]:
+    """A query over new segments, with the golds given."""
+    return lambda *golds: Query(tuple(make_segment(gold=g) for g in (golds or (0.0, 1.0))))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store[Segment]]:
+    with Store[Segment](tmp_path / "store") as opened:
+        yield opened
+
+
+@pytest.fixture
+def text_store(tmp_path: Path) -> Iterator[Store[Response]]:
+    with Store[Response](tmp_path / "text") as opened:
+        yield opened

@@ -1,0 +1,96 @@
+"""Control tasks: lengths, ids and spaces that cannot be are told apart; terminations are off unless asked for."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from prefrl.components import ConfigError
+from prefrl.envs.control import ControlSettings
+
+
+def test_seconds_become_steps_by_the_rate_of_the_simulation() -> None:
+    assert ControlSettings(env="Pendulum-v1", segment_seconds=1.5).build().segment_steps == 30
+    assert ControlSettings(env="CartPole-v1", segment_seconds=0.5).build().segment_steps == 25
+    hopper = ControlSettings(env="Hopper-v5", segment_seconds=1.0).build()
+    assert hopper.segment_steps == 125
+    assert hopper.fps == pytest.approx(125.0)
+
+
+def test_a_task_says_what_its_spaces_are() -> None:
+    pendulum = ControlSettings(env="Pendulum-v1").build()
+    assert (pendulum.observation_size, pendulum.action_size, pendulum.horizon) == (3, 1, 200)
+    assert pendulum.action_bounds is not None
+    assert [b.tolist() for b in pendulum.action_bounds] == [[-2.0], [2.0]]
+    cartpole = ControlSettings(env="CartPole-v1").build()
+    assert (cartpole.action_size, cartpole.action_bounds, cartpole.kind) == (2, None, "control")
+
+
+def test_a_segment_longer_than_the_episode_is_refused_with_both_numbers() -> None:
+    with pytest.raises(ConfigError, match=r"segment of 300 steps is longer than an episode of 200"):
+        ControlSettings(env="Pendulum-v1", segment_steps=300).build()
+
+
+def test_two_lengths_are_refused() -> None:
+    with pytest.raises(ConfigError, match="not both"):
+        ControlSettings(segment_steps=3, segment_seconds=1.0).build()
+
+
+@pytest.mark.parametrize(("wrong", "right"), [("Pendulm-v1", "Pendulum-v1"), ("hopper", "Hopper-v5")])
+def test_an_unknown_id_is_refused_with_the_nearest(wrong: str, right: str) -> None:
+    with pytest.raises(ConfigError, match=f"did you mean '{right}'"):
+        ControlSettings(env=wrong).build()
+
+
+def test_an_id_cannot_name_code_to_import() -> None:
+    with pytest.raises(ConfigError, match="unknown gymnasium environment"):
+        ControlSettings(env="antigravity:Pendulum-v1").build()
+
+
+def test_spaces_that_cannot_be_learned_are_refused() -> None:
+    with pytest.raises(ConfigError, match="observations must be a flat Box"):
+        ControlSettings(env="FrozenLake-v1", segment_steps=5).build()
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "Hopper-v5", "Walker2d-v5"])
+def test_episodes_have_a_fixed_horizon_where_the_environment_allows_it(name: str) -> None:
+    task = ControlSettings(env=name, horizon=60, segment_steps=5).build()
+    envs = task.environments(2)
+    envs.reset(np.random.default_rng(0))
+    action = np.eye(task.action_size, dtype=np.float32)[[0, 0]]
+    steps = [envs.step(action) for _ in range(60)]
+    assert not any(s.terminated.any() for s in steps)
+    assert [bool(s.truncated.all()) for s in steps] == [False] * 59 + [True]
+
+
+def test_episodes_may_end_early_when_asked_to() -> None:
+    task = ControlSettings(env="CartPole-v1", variable_horizon=True, segment_steps=5).build()
+    envs = task.environments(1)
+    envs.reset(np.random.default_rng(0))
+    assert any(envs.step(np.array([[1.0, 0.0]], np.float32)).terminated.all() for _ in range(30))
+
+
+def test_cartpole_that_fell_earns_nothing_and_goes_on() -> None:
+    task = ControlSettings(env="CartPole-v1", segment_steps=5).build()
+    envs = task.environments(1)
+    envs.reset(np.random.default_rng(0))
+    gold = [float(envs.step(np.array([[1.0, 0.0]], np.float32)).rewards[0]) for _ in range(20)]
+    assert gold[0] == 1.0
+    assert gold[-1] == 0.0
+
+
+def test_an_environment_without_a_time_limit_needs_a_horizon() -> None:
+    class Still(gymnasium.Env[np.ndarray, np.ndarray]):
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    gymnasium.register("Still-v0", Still)  # type: ignore[arg-type]
+    try:
+        with pytest.raises(ConfigError, match=r"task\.horizon"):
+            ControlSettings(env="Still-v0").build()
+        with pytest.raises(ConfigError, match="segment_steps or fps"):
+            ControlSettings(env="Still-v0", horizon=10).build()
+        assert ControlSettings(env="Still-v0", horizon=10, fps=2.0).build().segment_steps == 3
+    finally:
+        del gymnasium.registry["Still-v0"]

@@ -1,0 +1,244 @@
+"""The policy-gradient core against closed forms and exact enumeration: a vocabulary of 3, sequences of length 3."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from prefrl.improve import objectives as o
+
+V, L = 3, 3
+SEQUENCES = torch.tensor(list(itertools.product(range(V), repeat=L)))
+PREFIXES = [prefix for t in range(L) for prefix in itertools.product(range(V), repeat=t)]
+ROWS = torch.tensor([[PREFIXES.index(tuple(s[:t].tolist())) for t in range(L)] for s in SEQUENCES])
+MASK = torch.ones(len(SEQUENCES), L)
+BETA = 0.3
+
+
+def make(seed: int) -> Tensor:
+    """A policy without structure: logits for each of the 13 prefixes."""
+    return torch.randn(len(PREFIXES), V, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def token_logp(theta: Tensor) -> Tensor:
+    """(27, 3): log-probabilities of every token of every sequence."""
+    return theta.log_softmax(-1)[ROWS, SEQUENCES]
+
+
+def probability(theta: Tensor) -> Tensor:
+    return token_logp(theta).sum(1).exp()
+
+
+THETA, REF = make(0).requires_grad_(), make(1)
+REWARD = torch.randn(len(SEQUENCES), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+P = probability(THETA).detach()
+
+
+def exact_objective(theta: Tensor) -> Tensor:
+    """E[r] - beta KL(pi || ref), by enumeration."""
+    logp, ref = token_logp(theta).sum(1), token_logp(REF).sum(1)
+    return (logp.exp() * (REWARD - BETA * (logp - ref))).sum()
+
+
+def gradient(value: Tensor) -> Tensor:
+    return torch.autograd.grad(value, THETA)[0]
+
+
+def expected(losses: Tensor) -> Tensor:
+    """The expectation under the policy's own samples, whose probabilities are constants to the estimator."""
+    return (P * losses).sum()
+
+
+def kl_rewards() -> Tensor:
+    kl = o.kl_k1(token_logp(THETA).detach(), token_logp(REF))
+    return o.step_rewards(REWARD, kl, MASK, BETA)
+
+
+def test_reinforce_with_kl_in_the_reward_has_the_exact_gradient() -> None:
+    returns = o.returns_to_go(kl_rewards(), MASK)
+    loss = expected(o.policy_gradient(token_logp(THETA), returns).sum(1))
+    torch.testing.assert_close(gradient(loss), -gradient(exact_objective(THETA)))
+
+
+def test_whole_sequence_advantages_have_the_exact_gradient_too() -> None:
+    scores = kl_rewards().sum(1, keepdim=True).expand(-1, L)
+    loss = expected(o.policy_gradient(token_logp(THETA), scores).sum(1))
+    torch.testing.assert_close(gradient(loss), -gradient(exact_objective(THETA)))
+
+
+def test_leave_one_out_is_unbiased_over_all_pairs_of_samples() -> None:
+    scores = kl_rewards().sum(1)
+    pairs = torch.tensor(list(itertools.product(range(len(P)), repeat=2)))
+    advantages = o.leave_one_out(scores[pairs])
+    logp = token_logp(THETA).sum(1)[pairs]
+    loss = (P[pairs].prod(1) * o.policy_gradient(logp, advantages).mean(1)).sum()
+    torch.testing.assert_close(gradient(loss), -gradient(exact_objective(THETA)))
+
+
+def test_the_clipped_surrogate_at_ratio_one_has_the_policy_gradient() -> None:
+    advantages = torch.randn(len(P), L, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    logp = token_logp(THETA)
+    ratios = o.log_ratio(logp, logp.detach(), MASK)
+    clipped = gradient(o.clipped_surrogate(ratios, advantages, 0.2).sum())
+    torch.testing.assert_close(clipped, gradient(o.policy_gradient(token_logp(THETA), advantages).sum()))
+
+
+def test_the_optimum_is_the_reference_tilted_by_the_reward() -> None:
+    logp = (token_logp(REF).sum(1) + REWARD / BETA).log_softmax(0)
+    tilted = torch.empty_like(THETA)
+    for row, prefix in enumerate(PREFIXES):
+        below = (SEQUENCES[:, : len(prefix)] == torch.tensor(prefix)).all(1) if prefix else torch.ones(27, dtype=torch.bool)
+        for token in range(V):
+            tilted[row, token] = logp[below & (SEQUENCES[:, len(prefix)] == token)].logsumexp(0)
+    best = tilted.detach().requires_grad_()
+    torch.testing.assert_close(probability(best), logp.exp())
+    torch.testing.assert_close(torch.autograd.grad(exact_objective(best), best)[0], torch.zeros_like(best))
+
+
+def exact_kl(a: Tensor, b: Tensor) -> Tensor:
+    return (probability(a) * (token_logp(a) - token_logp(b)).sum(1)).sum()
+
+
+def sequence_logp(theta: Tensor) -> Tensor:
+    return token_logp(theta).sum(1)
+
+
+def test_k1_and_k3_are_unbiased_estimates_of_the_kl() -> None:
+    for estimator in (o.kl_k1, o.kl_k3):
+        value = expected(estimator(sequence_logp(THETA), sequence_logp(REF)))
+        torch.testing.assert_close(value, exact_kl(THETA, REF))
+    assert (o.kl_k3(sequence_logp(THETA), sequence_logp(REF)) >= 0).all()
+
+
+def test_as_a_loss_only_k2_has_the_gradient_of_the_kl() -> None:
+    logp, ref = sequence_logp(THETA), sequence_logp(REF)
+    torch.testing.assert_close(gradient(expected(o.kl_k2(logp, ref))), gradient(exact_kl(THETA, REF)))
+    zero = torch.zeros_like(THETA)
+    torch.testing.assert_close(gradient(expected(o.kl_k1(sequence_logp(THETA), ref))), zero)
+    reverse = gradient(exact_kl(REF, THETA))
+    torch.testing.assert_close(gradient(expected(o.kl_k3(sequence_logp(THETA), ref))), reverse)
+
+
+def naive_gae(
+    rewards: Tensor, values: Tensor, following: Tensor, ends: Tensor, discount: float, trace: float
+) -> Tensor:
+    """The definition: sums of discounted TD residuals up to the end of the episode."""
+    out = torch.zeros_like(rewards)
+    for b, t in itertools.product(range(rewards.shape[0]), range(rewards.shape[1])):
+        weight = 1.0
+        for k in range(t, rewards.shape[1]):
+            out[b, t] += weight * (rewards[b, k] + discount * following[b, k] - values[b, k])
+            if ends[b, k]:
+                break
+            weight *= discount * trace
+    return out
+
+
+@given(seed=st.integers(0, 1000), discount=st.sampled_from([0.0, 0.9, 1.0]), trace=st.sampled_from([0.0, 0.95, 1.0]))
+@settings(max_examples=30, deadline=None)
+def test_gae_is_its_definition(seed: int, discount: float, trace: float) -> None:
+    g = torch.Generator().manual_seed(seed)
+    rewards, values, following = torch.randn(3, 2, 6, generator=g, dtype=torch.float64)
+    ends = torch.rand(2, 6, generator=g) < 0.3
+    got = o.gae(rewards, values, following, ends, discount, trace)
+    torch.testing.assert_close(got, naive_gae(rewards, values, following, ends, discount, trace))
+
+
+def test_gae_without_discount_or_trace_decay_is_return_minus_value() -> None:
+    rewards, values = torch.randn(2, 2, 5, dtype=torch.float64)
+    following = torch.cat([values[:, 1:], torch.zeros(2, 1, dtype=torch.float64)], 1)
+    ends = torch.zeros(2, 5)
+    ends[:, -1] = 1
+    got = o.gae(rewards, values, following, ends, 1.0, 1.0)
+    torch.testing.assert_close(got, o.returns_to_go(rewards, torch.ones(2, 5)) - values)
+
+
+def test_a_time_limit_bootstraps_and_a_termination_does_not() -> None:
+    rewards, values, ends = torch.ones(2, 1), torch.zeros(2, 1), torch.ones(2, 1)
+    following = torch.tensor([[10.0], [0.0]])  # truncated; terminated
+    torch.testing.assert_close(o.gae(rewards, values, following, ends, 0.9, 1.0), torch.tensor([[10.0], [1.0]]))
+
+
+def test_returns_to_go_by_hand() -> None:
+    rewards, mask = torch.tensor([[1.0, 2.0, 4.0], [1.0, 2.0, math.nan]]), torch.tensor([[1.0, 1, 1], [1, 1, 0]])
+    torch.testing.assert_close(o.returns_to_go(rewards, mask), torch.tensor([[7.0, 6, 4], [3, 2, 0]]))
+    torch.testing.assert_close(o.returns_to_go(rewards, mask, 0.5), torch.tensor([[3.0, 4, 4], [2, 2, 0]]))
+
+
+def test_step_rewards_put_the_score_on_the_last_real_token() -> None:
+    kl, mask = torch.tensor([[1.0, 2.0, 9.0], [1.0, 2.0, 3.0]]), torch.tensor([[1.0, 1, 0], [1, 1, 1]])
+    got = o.step_rewards(torch.tensor([10.0, 20.0]), kl, mask, 0.5)
+    torch.testing.assert_close(got, torch.tensor([[-0.5, 9.0, 0.0], [-0.5, -1.0, 18.5]]))
+
+
+def test_step_rewards_of_an_empty_response_are_zero() -> None:
+    got = o.step_rewards(torch.tensor([10.0]), torch.ones(1, 3), torch.zeros(1, 3), 0.5)
+    torch.testing.assert_close(got, torch.zeros(1, 3))
+
+
+def test_reductions_by_hand_and_their_length_bias() -> None:
+    x, mask = torch.tensor([[1.0, 1.0, 1.0, 1.0], [3.0, math.nan, math.nan, math.nan]]), torch.ones(2, 4)
+    mask[1, 1:] = 0
+    assert o.reduce(x, mask, "token").item() == pytest.approx(7 / 5)
+    assert o.reduce(x, mask, "sequence").item() == pytest.approx((1 + 3) / 2)
+    assert o.reduce(x, mask, "constant", 4).item() == pytest.approx(7 / 8)
+
+
+def test_masked_statistics_ignore_what_padding_holds() -> None:
+    x, mask = torch.tensor([[1.0, 2.0, 3.0, math.nan]]), torch.tensor([[1.0, 1, 1, 0]])
+    assert o.masked_mean(x, mask).item() == pytest.approx(2)
+    white = o.masked_whiten(x, mask)
+    scale = math.sqrt(1.5)
+    torch.testing.assert_close(white, torch.tensor([[-scale, 0.0, scale, 0.0]]))
+    kept = o.masked_whiten(x, mask, shift_mean=False)
+    torch.testing.assert_close(kept, torch.tensor([[scale, 2 * scale, 3 * scale, 0.0]]))
+
+
+def test_groups_of_equal_scores_get_exactly_no_advantage() -> None:
+    scores = torch.tensor([[0.1, 0.1, 0.1], [1.0, 2.0, 3.0]])
+    normalised = o.group_normalised(scores, eps=0.0)
+    assert (normalised[0] == 0).all()
+    torch.testing.assert_close(normalised[1], torch.tensor([-1.0, 0.0, 1.0]))
+    torch.testing.assert_close(o.leave_one_out(scores)[1], torch.tensor([1 - 2.5, 0.0, 3 - 1.5]))
+
+
+@pytest.mark.parametrize("advantage", [o.leave_one_out, o.group_normalised])
+def test_one_response_a_prompt_is_an_error(advantage: object) -> None:
+    assert callable(advantage)
+    with pytest.raises(ValueError, match="at least 2 responses"):
+        advantage(torch.ones(4, 1))
+
+
+def test_the_surrogate_stops_paying_outside_the_clip() -> None:
+    ratios = torch.tensor([0.5, 1.0, 1.5]).log().requires_grad_()
+    up = o.clipped_surrogate(ratios, torch.ones(3), 0.2)
+    torch.testing.assert_close(up, torch.tensor([-0.5, -1.0, -1.2]))
+    down = o.clipped_surrogate(ratios, -torch.ones(3), 0.2)
+    torch.testing.assert_close(down, torch.tensor([0.8, 1.0, 1.5]))
+    assert torch.autograd.grad(up.sum(), ratios)[0][2] == 0
+
+
+def test_log_ratios_are_bounded_and_zero_on_padding() -> None:
+    got = o.log_ratio(torch.tensor([[1000.0, math.nan]]), torch.zeros(1, 2), torch.tensor([[1.0, 0.0]]))
+    torch.testing.assert_close(got, torch.tensor([[o.MAX_LOG_RATIO, 0.0]]))
+
+
+def test_value_loss_takes_the_worse_of_free_and_clipped() -> None:
+    values, old, returns = torch.tensor([2.0, 0.1]), torch.zeros(2), torch.tensor([2.0, 0.0])
+    torch.testing.assert_close(o.value_loss(values, old, returns), torch.tensor([0.0, 0.005]))
+    torch.testing.assert_close(o.value_loss(values, old, returns, 0.2), torch.tensor([0.5 * 1.8**2, 0.005]))
+
+
+def test_entropy_of_even_odds_is_the_logarithm_of_the_choices() -> None:
+    torch.testing.assert_close(o.categorical_entropy(torch.zeros(2, 5)), torch.full((2,), math.log(5)))
+
+
+def test_the_adaptive_coefficient_moves_towards_its_target_and_no_faster_than_allowed() -> None:
+    start = o.AdaptiveKL(beta=0.1, target=6.0, horizon=1000)
+    assert start.update(6.0, 100).beta == pytest.approx(0.1)
+    assert start.update(600.0, 100).beta == pytest.approx(0.1 * (1 + 0.2 * 0.1))
+    assert start.update(0.0, 100).beta == pytest.approx(0.1 * (1 - 0.2 * 0.1))
