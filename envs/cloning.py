@@ -27,9 +27,9 @@ from torch import Tensor
 from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
 from transformers.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 
-from prefrl.files import DamagedError, verify, whole_folder
 from prefrl.components import Settings
 from prefrl.envs.grammar import Grammar
+from prefrl.files import DamagedError, verify, whole_folder
 from prefrl.seeding import draw_seed
 
 RECIPE = 1
@@ -119,7 +119,7 @@ def clone(settings: CloningSettings, grammar: Grammar) -> tuple[LlamaForCausalLM
         torch.manual_seed(draw_seed(rng))
         model = make_model(settings, tokenizer)
     batches = _batches(rows, settings.batch_size, rng)
-    optimizer = torch.optim.AdamW(model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01)
+    optimizer = torch.optim.AdamW(model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, len(batches)))
     with _progress(len(batches)) as report:
         for batch in batches:
@@ -159,7 +159,7 @@ def make_model(settings: CloningSettings, tokenizer: PreTrainedTokenizerFast) ->
     config = LlamaConfig(
         vocab_size=len(tokenizer),
         hidden_size=settings.width,
-        intermediate_size=settings.width * 8 // 3,
+        intermediate_size=max(32, settings.width * 8 // 3 // 32 * 32),
         num_hidden_layers=settings.layers,
         num_attention_heads=settings.heads,
         max_position_embeddings=512,

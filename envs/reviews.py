@@ -93,7 +93,7 @@ meal_fact_bad = i found a hair in it and felt sick | a rude waiter ignored our c
   | they ruined our evening
 hotel_name = hotel | guest house | resort | hostel | inn
 hotel_did = we stayed at this hotel | i spent a night at the inn | we booked the guest house | i slept at this hostel
-hotel_part = room | bed | breakfast | pool | view | lobby | shower | reception | garden
+hotel_part = room | bed | breakfast | pool | view | bathroom | shower | reception | garden
 hotel_parts = beds | towels | rooms | pillows | hallways | windows
 hotel_nice = clean | comfortable | elegant | charming | peaceful | welcoming | gorgeous | relaxing | spotless
 hotel_nasty = dirty | noisy | shabby | smelly | filthy | uncomfortable | ugly | damp

@@ -30,6 +30,10 @@ class ReviewsSettings(Settings):
     cloning: CloningSettings = CloningSettings()
     """The starting policy."""
 
+    def shrunk(self) -> ReviewsSettings:
+        small = {"layers": 1, "width": 32, "heads": 2, "vocabulary": 512, "reviews": 640}
+        return self.model_copy(update={"cloning": self.cloning.model_copy(update=small)})
+
     def build(self) -> Reviews:
         grammar = reviews()
         return Reviews(self, grammar, *self.cloning.build(grammar, source()))

@@ -20,10 +20,12 @@ from prefrl.seeding import streams
 from prefrl.store import Store
 
 
-def _component(role: Role, value: object) -> Settings:
-    """Look up the settings class of a `kind`, and check the other settings against it."""
+def _component(role: Role, default: str | None, value: object) -> Settings:
+    """Look up the settings class of a `kind` (the default one if none is given), and check the rest against it."""
     if isinstance(value, Settings):
         return value
+    if isinstance(value, dict) and default:
+        value = {"kind": default} | value
     if not isinstance(value, dict) or not isinstance(value.get("kind"), str):
         raise ConfigError(f": expected settings with a kind ({', '.join(kinds(role))}), got {value!r}")
     try:
@@ -39,21 +41,21 @@ def _component(role: Role, value: object) -> Settings:
 class Config(Settings):
     """Everything that a run needs. A component is told by its `kind`; `prefrl describe KIND` lists its settings."""
 
-    task: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "tasks"))]
+    task: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "tasks", None))]
     """Where behaviours come from."""
-    labeler: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "labelers"))] = Field(
-        {"kind": "oracle"}, validate_default=True
+    labeler: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "labelers", "oracle"))] = Field(
+        {}, validate_default=True
     )
     """Who answers."""
-    select: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "selectors"))] = Field(
-        {"kind": "uniform"}, validate_default=True
+    select: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "selectors", "uniform"))] = Field(
+        {}, validate_default=True
     )
     """Which candidates are worth a label."""
-    reward: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "rewards"))]
+    reward: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "rewards", None))]
     """What is fitted."""
     fitting: FittingSettings = FittingSettings()
     """How it is fitted."""
-    learner: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "learners"))]
+    learner: Annotated[SerializeAsAny[Settings], BeforeValidator(partial(_component, "learners", None))]
     """The policy, and how it gets better."""
     loop: LoopSettings = LoopSettings()
     """How often, and how much is asked."""
@@ -77,7 +79,8 @@ class Config(Settings):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            raise ConfigError("\n".join(_explain(cls, one)[1:] for one in error.errors())) from None
+            lines = [line for one in error.errors() for line in _explain(cls, one).splitlines()]
+            raise ConfigError("\n".join(line.removeprefix(".") for line in lines)) from None
 
     def dump(self) -> str:
         """YAML with every default spelled out; `Config.parse` of it gives the same settings back."""
@@ -153,8 +156,8 @@ def _apply(data: dict[str, Any], override: str) -> None:
         raise ConfigError(f"{override!r}: expected dotted.key=value, for example learner.kind=sb3")
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: {text!r} is not a YAML value: {error}") from None
+    except yaml.YAMLError:
+        raise ConfigError(f"{path}: {text!r} is not a YAML value") from None
     *parents, last = path.split(".")
     for parent in parents:
         data = data.setdefault(parent, {})

@@ -7,7 +7,8 @@ One process writes at a time; any number may read while it does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Generic
@@ -18,6 +19,8 @@ from prefrl.blobs import read_arrays, write_arrays
 from prefrl.log import EventLog, StoreError, row
 from prefrl.types import Answer, C, Candidate, Comparison, Floats, Judged, Query, Ranking, Response, Segment, Skip
 
+WRITERS = 16
+"""Files written at once."""
 ANSWERS: dict[str, type[Comparison] | type[Ranking] | type[Skip]] = {
     "comparison": Comparison,
     "ranking": Ranking,
@@ -86,12 +89,10 @@ class Store(Generic[C]):
 
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
-        rows = []
-        for candidate in {c.id: c for query in queries for c in query.candidates}.values():
-            self._file(candidate)
-            rows.append(row(candidate.id, "candidate", body=_describe(candidate)))
-        for query in queries:
-            rows.append(row(query.id, "query", body={"candidates": [c.id for c in query.candidates]}))
+        candidates = {c.id: c for query in queries for c in query.candidates}
+        self._file(candidates.values())
+        rows = [row(id, "candidate", body=_describe(candidate)) for id, candidate in candidates.items()]
+        rows += [row(query.id, "query", body={"candidates": [c.id for c in query.candidates]}) for query in queries]
         self._log.append(rows)
 
     def answer(self, answers: Sequence[Answer]) -> None:
@@ -136,8 +137,7 @@ class Store(Generic[C]):
                     _answer(one["kind"], one["subject"], one["actor"], one["body"])
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise ValueError(f"event {number} cannot be merged: {error}") from error
-        for candidate in candidates.values():
-            self._file(candidate)
+        self._file(candidates.values())
         self._log.append(events)
         return sum(one["kind"] in ANSWERS for one in events)
 
@@ -145,8 +145,12 @@ class Store(Generic[C]):
         retracted = sum(a is None and (q, n) == (query, labeler) for _, q, n, a in self._view.answers)
         return f"{query}:{labeler}:{retracted}"
 
-    def _file(self, candidate: Candidate) -> None:
-        """Write the arrays and the gold of a candidate, each under its id, where they are not there yet."""
+    def _file(self, candidates: Iterable[Candidate]) -> None:
+        """Write arrays and gold, each under its id; in threads, since each file waits for the disk."""
+        with ThreadPoolExecutor(WRITERS) as pool:
+            list(pool.map(self._file_one, candidates))
+
+    def _file_one(self, candidate: Candidate) -> None:
         if isinstance(candidate, Segment):
             arrays = {"observations": candidate.observations, "actions": candidate.actions, "states": candidate.states}
             write_arrays(self.folder / "blobs", candidate.id, {k: v for k, v in arrays.items() if v is not None})

@@ -1,7 +1,10 @@
 """Small candidates and stores that many tests share."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -9,6 +12,9 @@ import torch
 
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
+
+if TYPE_CHECKING:
+    from prefrl.envs.text import Reviews
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -52,3 +58,14 @@ def store(tmp_path: Path) -> Iterator[Store[Segment]]:
 def text_store(tmp_path: Path) -> Iterator[Store[Response]]:
     with Store[Response](tmp_path / "text") as opened:
         yield opened
+
+
+@pytest.fixture(scope="session")
+def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
+    """The text task with a tiny starting policy, cloned once for all tests."""
+    from prefrl.envs.cloning import CloningSettings
+    from prefrl.envs.text import ReviewsSettings
+
+    cache = tmp_path_factory.mktemp("models")
+    cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
+    return ReviewsSettings(response_tokens=24, cloning=cloning).build()

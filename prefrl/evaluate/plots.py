@@ -73,15 +73,9 @@ def lines(
         axes = figure.add_subplot()
         for curve in drawn:
             _curve(axes, np.array(rounds), curve)
-        if max(abs(value) for curve in drawn for value in curve.values if value is not None) >= 10_000:
-            axes.yaxis.set_major_formatter(EngFormatter(sep=""))
-        if percent:
-            axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-            axes.set_ylim(top=1.02)
-        if zero:
-            axes.set_ylim(bottom=0)
+        _values_axis(axes, [v for curve in drawn for v in curve.values if v is not None], percent, zero)
         _rounds_axis(axes)
-        _legend(axes, len(drawn))
+        _legend(axes, sum(bool(curve.label) for curve in drawn))
 
     return _svg(name, draw) if drawn else Markup("")
 
@@ -159,7 +153,18 @@ def _curve(axes: Axes, rounds: np.ndarray, curve: Line) -> None:
         spread = np.array([0.0 if value is None else value for value in curve.spread])[there]
         axes.fill_between(x, y - spread, y + spread, color=colour, alpha=0.16, linewidth=0)
     dots = "o" if len(x) == 1 or (curve.dash == "-" and len(x) <= 25) else ""
-    axes.plot(x, y, curve.dash, color=colour, label=curve.label, marker=dots, markersize=4)
+    axes.plot(x, y, curve.dash, color=colour, label=curve.label, marker=dots, markersize=4, clip_on=False)
+
+
+def _values_axis(axes: Axes, values: list[float], percent: bool, zero: bool) -> None:
+    """Shares that are none, and counts below 0, are drawn as they are: a wrong number must be seen."""
+    if percent and min(values) >= 0 and max(values) <= 1:
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.set_ylim(top=1.0)
+    elif max(map(abs, values)) >= 10_000:
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+    if zero and min(values) >= 0 < max(values):
+        axes.set_ylim(bottom=0)
 
 
 def _rounds_axis(axes: Axes) -> None:
@@ -169,7 +174,7 @@ def _rounds_axis(axes: Axes) -> None:
 
 def _legend(axes: Axes, entries: int) -> None:
     """Above the axes, where it hides nothing."""
-    if entries > 1:
+    if entries:
         axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.98), ncols=entries, handlelength=1.4, borderaxespad=0)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from prefrl.files import write_file
 from prefrl.evaluate.chapters import chapters
 from prefrl.evaluate.facts import calibration, gather
 from prefrl.evaluate.records import Record, read
 from prefrl.evaluate.words import headline, show_count, show_number, show_share, show_time, verdict
+from prefrl.files import write_file
 
 
 def write_report(folder: Path) -> Path:

@@ -7,21 +7,22 @@ from prefrl.evaluate.facts import Facts
 
 def headline(facts: Facts) -> str:
     """What happened, in one plain sentence."""
-    start = f"{show_count(facts.rounds, 'round')}"
     spent = [
         show_count(facts.labels["answered"], "label") if facts.labels["answered"] is not None else "",
         show_count(sum(v or 0 for v in facts.steps.values()), _unit(facts.kind)) if any(facts.steps.values()) else "",
         show_time(facts.total_seconds) if facts.total_seconds else "",
     ]
     cost = ", ".join(word for word in spent if word)
-    took = f"{'in' if facts.finished else 'so far, in'} {start}" + (f" ({cost})" if cost else "")
+    took = f"{'in' if facts.finished else 'so far, in'} {show_count(facts.rounds, 'round')}" + (
+        f" ({cost})" if cost else ""
+    )
     before, after, _ = facts.gold
     if before is None or after is None:
         return f"There is no gold to tell whether it helped, {took}." if facts.rounds else "No round is over yet."
-    words = f"from {show_number(before, after)} to {show_number(after, before)}"
-    if after == before:
-        return f"Gold stayed at {show_number(after)} {took}."
-    return f"Gold {'rose' if after > before else 'fell'} {words} {took}."
+    start, end = show_number(before, after), show_number(after, before)
+    if start == end:
+        return f"Gold stayed at {end} {took}."
+    return f"Gold {'rose' if after > before else 'fell'} from {start} to {end} {took}."
 
 
 def verdict(facts: Facts) -> str:
@@ -33,13 +34,17 @@ def verdict(facts: Facts) -> str:
         if after < before:
             remarks.append("The policy got worse.")
         if after != before and spreads and abs(after - before) < min(spreads):
-            remarks.append("The change is smaller than one standard deviation between episodes.")
+            what = "responses" if facts.kind == "text" else "episodes"
+            remarks.append(f"The change is smaller than one standard deviation between {what}.")
         if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
     start, end = facts.fluency
     if start is not None and end is not None:
-        change = "fell" if end < start else "rose" if end > start else "stayed"
-        remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
+        if show_share(start) == show_share(end):
+            remarks.append(f"Fluency stayed at {show_share(end)}.")
+        else:
+            change = "fell" if end < start else "rose"
+            remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
     return " ".join(remarks)
 
 

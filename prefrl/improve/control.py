@@ -82,6 +82,13 @@ class PPOSettings(Settings):
             )
         return self
 
+    def shrunk(self) -> PPOSettings:
+        steps = min(self.steps_per_round, self.environments * self.rollout_steps)
+        return self.model_copy(update={"steps_per_round": steps, "evaluation_episodes": 1})
+
+    def work(self) -> float:
+        return float(self.steps_per_round)
+
     def build(self, task: Task, rng: np.random.Generator) -> PPO:
         return PPO(self, control(task, self.kind), rng)
 
@@ -197,9 +204,7 @@ class PPO:
             for rows in self._minibatches(len(data.returns), self._settings.critic_epochs, rng):
                 self._descend(self._value_loss(data, rows))
             data, spread = self._data(rollout, rewards)
-        losses = [
-            self._update(data, rows) for rows in self._minibatches(len(data.returns), self._settings.epochs, rng)
-        ]
+        losses = [self._update(data, rows) for rows in self._minibatches(len(data.returns), self._settings.epochs, rng)]
         self.policy.observe(rollout.observations)
         self._steer(float(np.mean([loss[4] for loss in losses[-len(losses) // self._settings.epochs :]])))
         means = torch.tensor(losses).mean(0).tolist()

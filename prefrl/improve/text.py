@@ -91,6 +91,12 @@ class TextSettings(Settings):
             raise ValueError("kl_target steers beta, so beta must start above 0")
         return self
 
+    def shrunk(self) -> TextSettings:
+        return self.model_copy(update={"updates": 1, "prompts": min(self.prompts, 4), "evaluation_prompts": 8})
+
+    def work(self) -> float:
+        return float(self.updates * self.prompts)
+
     def build(self, task: Task, rng: np.random.Generator) -> TextLearner:
         return TextLearner(self, text(task, self.kind))
 

@@ -78,8 +78,8 @@ class Terminal:
             return
         texts = [c for c in candidates if isinstance(c, Response)]
         width = max(24, self.console.width // len(texts) - 2)
-        panels = [Panel(Text(t.text), title=str(n + 1), width=width) for n, t in enumerate(texts)]
-        self.console.print(Group(Text(texts[0].prompt, style="bold"), Columns(panels, padding=(0, 1))))
+        panels = [Panel(Text(visible(t.text)), title=str(n + 1), width=width) for n, t in enumerate(texts)]
+        self.console.print(Group(Text(visible(texts[0].prompt), style="bold"), Columns(panels, padding=(0, 1))))
 
     def _ask(self, count: int) -> str:
         """A line that can be interpreted; the rules are shown again after one that cannot."""
@@ -100,6 +100,11 @@ class Terminal:
             self.console.print(Text("nothing to undo in this sitting", style="red"))
             return
         store.retract(done.pop(), self.name)
+
+
+def visible(text: str) -> str:
+    """Text from models is untrusted: what would steer the terminal, or reverse the reading order, shows as a mark."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def understood(typed: str, count: int) -> bool:

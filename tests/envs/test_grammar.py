@@ -23,7 +23,16 @@ def test_the_small_grammar_accepts_exactly_what_it_can_write() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "Ann", "ann likes tea.", "Ann likes tea", "Ann likes  tea.", "Ann likes tea .", "Ann likes tea. Ann", "Ann likes TEA."],
+    [
+        "",
+        "Ann",
+        "ann likes tea.",
+        "Ann likes tea",
+        "Ann likes  tea.",
+        "Ann likes tea .",
+        "Ann likes tea. Ann",
+        "Ann likes TEA.",
+    ],
 )
 def test_anything_else_is_not_accepted(text: str) -> None:
     assert not parse(SMALL, "review").accepts(text)
@@ -41,7 +50,12 @@ def test_rendering_makes_sentences() -> None:
 
 @pytest.mark.parametrize(
     ("rules", "message"),
-    [("a = <b>", "no rule for b"), ("a = <b>\nb = x <a>", "is a cycle"), ("a = x\na = y", "each name once"), ("a", "expected")],
+    [
+        ("a = <b>", "no rule for b"),
+        ("a = <b>\nb = x <a>", "is a cycle"),
+        ("a = x\na = y", "each name once"),
+        ("a", "expected"),
+    ],
 )
 def test_a_wrong_grammar_says_what_is_wrong(rules: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -1,0 +1,115 @@
+"""A tiny control task, and stand-ins for reward models, that tests of learners share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+import torch
+
+from prefrl.envs.control import GymnasiumTask
+from prefrl.envs.fast.classic import Bools, Vectorised
+from prefrl.protocols import Environments, Transition
+from prefrl.types import Floats, Segment, State
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point on a line, pushed left and right: stay at 0. Discrete: pushed by -1 or +1."""
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        return rng.uniform(-1.0, 1.0, (count, 1))
+
+    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+        push = actions[:, 0] if actions.shape[1] == 1 else actions @ np.array([-1.0, 1.0])
+        moved = np.clip(states[:, 0] + 0.2 * push, -2.0, 2.0)
+        return moved[:, None], -np.abs(moved), np.zeros(len(states), bool)
+
+    def observe(self, states: Floats) -> Floats:
+        return states.astype(np.float32)
+
+
+@dataclass
+class Watched:
+    """Environments that count every step, and may hide the gold."""
+
+    inner: Environments
+    count: int
+    spent: list[int]
+    hide: bool
+
+    def reset(self, rng: np.random.Generator) -> Floats:
+        return self.inner.reset(rng)
+
+    def states(self) -> Floats | None:
+        return self.inner.states()
+
+    def step(self, actions: Floats) -> Transition:
+        self.spent.append(self.count)
+        step = self.inner.step(actions)
+        return step._replace(rewards=np.full_like(step.rewards, np.nan)) if self.hide else step
+
+
+@dataclass(frozen=True)
+class Known:
+    """A reward model that was told the reward: a function of observations and actions."""
+
+    function: Callable[[Floats, Floats], Floats] = field(default=lambda o, a: 1.0 - 2.0 * np.abs(o[..., 0]))
+    members: int = 1
+    fitted: bool = True
+
+    def rewards(self, observations: Floats, actions: Floats) -> Floats:
+        return self.function(observations, actions).astype(np.float32)
+
+    def stack(self, candidates: Sequence[Segment]) -> Mapping[str, torch.Tensor]:
+        raise NotImplementedError
+
+    def scores(self, stacked: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        raise NotImplementedError
+
+    def parameters(self) -> Iterable[torch.nn.Parameter]:
+        return []
+
+    def settle(self, stacked: Mapping[str, torch.Tensor]) -> None: ...
+
+    def member_scores(self, candidates: Sequence[Segment]) -> Floats:
+        return np.stack([[self.rewards(c.observations, c.actions).sum() for c in candidates]])
+
+    def score(self, candidates: Sequence[Segment]) -> Floats:
+        return self.member_scores(candidates)[0]
+
+    def state(self) -> State:
+        return {}
+
+    def load(self, state: State) -> None: ...
+
+
+@pytest.fixture
+def known() -> type[Known]:
+    return Known
+
+
+@pytest.fixture
+def point() -> Callable[..., GymnasiumTask]:
+    """point(discrete=False, spent=[], hide_gold=False) -> task; `spent` grows by the environments of each step."""
+
+    def make(discrete: bool = False, spent: list[int] | None = None, hide_gold: bool = False) -> GymnasiumTask:
+        box = (np.float32([-1.0]), np.float32([1.0]))
+        task = GymnasiumTask(
+            name="Point",
+            horizon=20,
+            segment_steps=5,
+            observation_size=1,
+            action_size=2 if discrete else 1,
+            action_bounds=None if discrete else box,
+            fps=5.0,
+            frame_size=64,
+            make=lambda n: Vectorised(Point(), n, 20),
+        )
+        made = task.make
+        kept: list[int] = [] if spent is None else spent
+        return replace(task, make=lambda n: Watched(made(n), n, kept, hide_gold))
+
+    return make

@@ -1,0 +1,297 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+
+from prefrl.components import ConfigError
+from prefrl.envs.text import Reviews
+from prefrl.improve.formula import text_formula
+from prefrl.improve.responses import Responses, check_head
+from prefrl.improve.text import TextLearner, TextSettings, advantages_of
+from prefrl.protocols import RewardModel, Store
+from prefrl.types import Floats, Response, State
+
+NO_STORE = cast("Store[Response]", None)
+SMALL: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "evaluation_prompts": 16, "chunk": 7}
+
+
+@dataclass
+class Rewarded:
+    """A reward that likes one token, or any other function of a response."""
+
+    token: int = 5
+    constant: float | None = None
+    seen: tuple[Response, ...] = ()
+
+    def score(self, candidates: Sequence[Response]) -> Floats:
+        self.seen = tuple(candidates)
+        if self.constant is not None:
+            return np.full(len(candidates), self.constant, np.float32)
+        return np.array([r.tokens.count(self.token) for r in candidates], np.float32)
+
+
+def reward(token: int = 5, constant: float | None = None) -> RewardModel[Response]:
+    return cast("RewardModel[Response]", Rewarded(token, constant))
+
+
+def learner(task: Reviews, **changes: object) -> TextLearner:
+    settings = TextSettings.model_validate({**SMALL, **changes})
+    return settings.build(task, np.random.default_rng(0))
+
+
+def flat(model: torch.nn.Module) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in model.parameters()])
+
+
+def word(task: Reviews, text: str = " the") -> int:
+    (token,) = task.tokenizer.encode(text, add_special_tokens=False)
+    return int(token)
+
+
+VARIANTS: list[dict[str, object]] = [
+    {},
+    {"beta": 0.0},
+    {"advantage": "group_normalised", "reduction": "sequence", "clip": 0.2, "epochs": 2, "minibatches": 2, "kl_in": "loss"},
+    {"advantage": "batch_mean", "reduction": "token", "temperature": 0.8, "kl_target": 3.0},
+]
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_every_variant_learns_to_say_the_rewarded_word_more_often(toy_reviews: Reviews, changes: dict[str, object]) -> None:
+    likes = reward(word(toy_reviews))
+    one = learner(toy_reviews, updates=12, prompts=8, learning_rate=5e-3, **changes)
+    before = one.evaluate(likes, np.random.default_rng(0)).metrics["learned"]
+    metrics = one.improve(likes, NO_STORE, np.random.default_rng(1))
+    after = one.evaluate(likes, np.random.default_rng(0)).metrics["learned"]
+    assert after > before + 0.5
+    assert metrics["ratio_error"] < 1e-3
+
+
+@pytest.mark.parametrize("changes", VARIANTS)
+def test_the_same_seed_gives_the_same_bytes_and_a_resumed_learner_goes_on_alike(
+    toy_reviews: Reviews, changes: dict[str, object]
+) -> None:
+    likes, whole, first, second = reward(word(toy_reviews)), *(learner(toy_reviews, **changes) for _ in range(3))
+    for seed in (1, 2):
+        whole.improve(likes, NO_STORE, np.random.default_rng(seed))
+    first.improve(likes, NO_STORE, np.random.default_rng(1))
+    second.load(first.state())
+    second.improve(likes, NO_STORE, np.random.default_rng(2))
+    assert torch.equal(flat(whole.model), flat(second.model))
+    assert whole.steps == second.steps
+    assert whole.state()["beta"] == second.state()["beta"]
+
+
+def test_gold_is_neither_read_nor_attached_while_learning(toy_reviews: Reviews) -> None:
+    blind = _WithoutGold(toy_reviews)
+    seeing, unseeing = learner(toy_reviews), TextSettings(**SMALL).build(blind, np.random.default_rng(0))
+    for one in (seeing, unseeing):
+        one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    assert torch.equal(flat(seeing.model), flat(unseeing.model))
+    likes = Rewarded()
+    seeing.improve(cast("RewardModel[Response]", likes), NO_STORE, np.random.default_rng(2))
+    assert all(r.gold is None for r in likes.seen)
+
+
+class _WithoutGold:
+    """The same task, with every gold value replaced by NaN."""
+
+    def __init__(self, task: Reviews) -> None:
+        self.name, self.kind = task.name, task.kind
+        self.tokenizer, self.response_tokens = task.tokenizer, task.response_tokens
+        self.model, self.prompts, self.evaluation_prompts = task.model, task.prompts, task.evaluation_prompts
+        self.fluency = task.fluency
+
+    def gold(self, responses: Sequence[Response]) -> Floats:
+        return np.full(len(responses), np.nan, np.float32)
+
+
+def test_samples_come_in_groups_with_tokens_and_gold(toy_reviews: Reviews) -> None:
+    found = learner(toy_reviews, asked_responses=3).sample(10, np.random.default_rng(0))
+    assert len(found) == 12
+    for i in range(0, 12, 3):
+        assert len({r.prompt for r in found[i : i + 3]}) == 1
+    for one in found:
+        assert one.gold is not None
+        assert one.gold.shape == (1,)
+        assert one.gold[0] == toy_reviews.gold([one])[0]
+        assert tuple(toy_reviews.tokenizer.encode(one.prompt)) == one.prompt_tokens
+        assert toy_reviews.tokenizer.decode(list(one.tokens), skip_special_tokens=True) == one.text
+
+
+def test_every_generated_token_is_counted_once_by_purpose(toy_reviews: Reviews) -> None:
+    one, likes = learner(toy_reviews), Rewarded()
+    found = one.sample(8, np.random.default_rng(0))
+    assert one.steps == (0, sum(len(r.tokens) for r in found), 0)
+    one.improve(cast("RewardModel[Response]", _counting := _Counting()), NO_STORE, np.random.default_rng(0))
+    assert one.steps.learn == _counting.tokens
+    one.evaluate(cast("RewardModel[Response]", likes), np.random.default_rng(0))
+    assert one.steps.evaluate == sum(len(r.tokens) for r in likes.seen)
+
+
+class _Counting:
+    tokens = 0
+
+    def score(self, candidates: Sequence[Response]) -> Floats:
+        self.tokens += sum(len(r.tokens) for r in candidates)
+        return np.arange(len(candidates), dtype=np.float32)
+
+
+def test_an_evaluation_repeats_itself_and_starts_without_kl(toy_reviews: Reviews) -> None:
+    one, likes = learner(toy_reviews), reward(word(toy_reviews))
+    first, second = (one.evaluate(likes, np.random.default_rng(3)) for _ in range(2))
+    assert first.metrics == second.metrics
+    assert abs(first.metrics["kl"]) < 1e-3
+    assert set(first.metrics) == {"gold", "gold_std", "learned", "kl", "length", "ended", "fluency"}
+    assert len(first.examples) == 4
+    assert all(r.gold is not None for r in first.examples)
+
+
+def test_evaluation_does_not_change_what_is_learned(toy_reviews: Reviews) -> None:
+    likes, plain, evaluated = reward(word(toy_reviews)), learner(toy_reviews), learner(toy_reviews)
+    evaluated.evaluate(likes, np.random.default_rng(0))
+    evaluated.sample(4, np.random.default_rng(0))
+    for one in (plain, evaluated):
+        one.improve(likes, NO_STORE, np.random.default_rng(1))
+    assert torch.equal(flat(plain.model), flat(evaluated.model))
+
+
+def test_the_kl_penalty_keeps_the_policy_near_its_start(toy_reviews: Reviews) -> None:
+    likes, kl = reward(word(toy_reviews)), {}
+    for beta in (0.0, 2.0):
+        one = learner(toy_reviews, updates=12, prompts=8, learning_rate=5e-3, beta=beta)
+        one.improve(likes, NO_STORE, np.random.default_rng(1))
+        kl[beta] = one.evaluate(likes, np.random.default_rng(0)).metrics["kl"]
+    assert kl[0.0] > 2 * max(kl[2.0], 0.1)
+
+
+def test_the_reference_is_not_run_while_its_weight_is_zero(toy_reviews: Reviews) -> None:
+    runs = []
+    for beta in (0.0, 0.1):
+        one = learner(toy_reviews, beta=beta)
+        one._reference.register_forward_pre_hook(lambda *_: runs.append(1))
+        one._reference.base_model.register_forward_pre_hook(lambda *_: runs.append(1))
+        one.improve(reward(), NO_STORE, np.random.default_rng(0))
+        assert bool(runs) == (beta > 0)
+
+
+def test_responses_without_an_end_are_penalised(toy_reviews: Reviews) -> None:
+    """With nothing else to go by, ending is what is learned."""
+    one = learner(toy_reviews, updates=10, prompts=8, learning_rate=5e-3, beta=0.0, missing_end_penalty=1.0)
+    before = one.evaluate(reward(constant=0.0), np.random.default_rng(0)).metrics["ended"]
+    one.improve(reward(constant=0.0), NO_STORE, np.random.default_rng(1))
+    assert one.evaluate(reward(constant=0.0), np.random.default_rng(0)).metrics["ended"] > before
+
+
+def test_equal_rewards_teach_nothing(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, beta=0.0, missing_end_penalty=0.0)
+    before = flat(one.model)
+    one.improve(reward(constant=3.0), NO_STORE, np.random.default_rng(1))
+    assert torch.equal(before, flat(one.model))
+
+
+def test_the_size_of_a_chunk_changes_the_gradient_by_rounding_only(toy_reviews: Reviews) -> None:
+    results = []
+    for chunk in (3, 1000):
+        one = learner(toy_reviews, updates=1, chunk=chunk, reduction="token", learning_rate=1e-9)
+        metrics = one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+        results.append((metrics["loss"], metrics["grad_norm"]))
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-3, atol=1e-5)
+
+
+def test_no_dropout_and_no_training_mode(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews)
+    one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    assert not any(m.training for m in [*one.model.modules(), *one._reference.modules()])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Reviews, bad: float) -> None:
+    with pytest.raises(FloatingPointError, match=r"the reward of update 0 is not finite"):
+        learner(toy_reviews).improve(reward(constant=bad), NO_STORE, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"responses": 1}, "at least 2 responses"),
+        ({"epochs": 2}, "need a clip"),
+        ({"minibatches": 1000, "clip": 0.2}, "cannot be 1000 minibatches"),
+        ({"kl_target": 3.0, "beta": 0.0}, "beta must start above 0"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_errors(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        TextSettings.model_validate(changes)
+
+
+def test_a_control_task_is_refused() -> None:
+    class Control:
+        name, kind = "pendulum", "control"
+
+    with pytest.raises(ConfigError, match="writes text"):
+        TextSettings().build(Control(), np.random.default_rng(0))
+
+
+def test_a_state_of_another_size_is_refused(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews)
+    state: State = one.state()
+    state["model"] = {name: p[..., :1] for name, p in state["model"].items()}
+    with pytest.raises(ValueError, match="other settings"):
+        one.load(state)
+
+
+def test_a_model_that_does_more_than_its_head_is_refused(toy_reviews: Reviews) -> None:
+    model = toy_reviews.model()
+    head = model.lm_head
+    model.lm_head = torch.nn.Sequential(head, torch.nn.Tanh())
+    check_head(model)
+    model.register_forward_hook(lambda _, args, out: replace_logits(out))
+    with pytest.raises(ConfigError, match="not supported"):
+        check_head(model)
+
+
+def replace_logits(out: Any) -> Any:
+    out["logits"] = out["logits"] * 2 + 1
+    return out
+
+
+def test_rows_and_chunks_keep_what_belongs_together() -> None:
+    mask = torch.tensor([[1, 1, 1], [1, 0, 0], [1, 1, 0]]).bool()
+    tokens = torch.tensor([[1, 2, 3], [4, 0, 0], [5, 6, 0]])
+    rows = Responses(("a", "b", "c"), ((7,), (8, 8, 8, 8), (9,)), tokens, mask, tokens * 0.1, mask[:, 2])
+    assert rows.count == 6
+    seen = {}
+    for at, some in rows.chunks(2):
+        for i, j in enumerate(at.tolist()):
+            seen[j] = (some.prompts[i], some.prompt_tokens[i], some.tokens[i, some.mask[i]].tolist())
+    assert seen == {0: ("a", (7,), [1, 2, 3]), 1: ("b", (8, 8, 8, 8), [4]), 2: ("c", (9,), [5, 6])}
+    (short,) = [some for at, some in rows.chunks(1) if at.tolist() == [1]]
+    assert short.tokens.shape == (1, 1)
+
+
+def test_advantages_by_hand() -> None:
+    returns = torch.tensor([[1.0, 3.0], [0.0, 0.0]])
+    assert advantages_of(returns, "leave_one_out").tolist() == [[-2.0, 2.0], [0.0, 0.0]]
+    assert advantages_of(returns, "batch_mean").tolist() == [[0.0, 2.0], [-1.0, -1.0]]
+    torch.testing.assert_close(
+        advantages_of(returns, "group_normalised"), torch.tensor([[-0.7071, 0.7071], [0.0, 0.0]]), atol=1e-3, rtol=0
+    )
+
+
+def test_the_formula_says_what_the_settings_say() -> None:
+    plain = text_formula(TextSettings(beta=0.05))
+    assert "mean_i sum_t [ log pi(y_t) A_i ]" in plain
+    assert "mean of the prompt's other R_j" in plain
+    assert "- 0.05 sum_t [log pi_old(y_t) - log ref(y_t)]" in plain
+    other = TextSettings(clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised")
+    assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 (log pi(y_t) - log ref(y_t))^2 / 2" in other.formula()
+    assert "ref" not in text_formula(TextSettings(beta=0.0))
+
+

@@ -1,0 +1,136 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from prefrl.label.exchange import export_bundle, export_preferences, import_bundle, import_preferences
+from prefrl.log import StoreError
+from prefrl.store import Store
+from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+
+
+def lines(*rows: dict[str, object]) -> str:
+    return "".join(json.dumps(row) + "\n" for row in rows)
+
+
+GOOD = {"prompt": "p", "chosen": "yes", "rejected": "no"}
+
+
+def texts(*names: str) -> Query[Response]:
+    return Query(tuple(Response("p", name) for name in names))
+
+
+def test_preferences_survive_going_out_and_coming_back(text_store: Store[Response], tmp_path: Path) -> None:
+    path, again = tmp_path / "in.jsonl", tmp_path / "out.jsonl"
+    path.write_text(lines(GOOD, {"prompt": "q", "chosen": "ü \u202e <b>", "rejected": ""}))
+    assert import_preferences(path, text_store) == 2
+    assert export_preferences(text_store, again).written == 2
+    assert [json.loads(x) for x in again.read_text().splitlines()] == [
+        json.loads(x) for x in path.read_text().splitlines()
+    ]
+
+
+def test_a_ranking_goes_out_as_its_pairs_and_ties_are_counted(text_store: Store[Response], tmp_path: Path) -> None:
+    query = texts("a", "b", "c")
+    by_text = {c.text: rank for c, rank in zip(query.candidates, (0, 1, 1), strict=True)}
+    text_store.ask([query])
+    text_store.answer([Ranking(query.id, (0, 1, 1), "me")])
+    done = export_preferences(text_store, tmp_path / "out.jsonl")
+    assert (done.written, done.ties) == (2, 1)
+    for row in map(json.loads, (tmp_path / "out.jsonl").read_text().splitlines()):
+        assert by_text[row["chosen"]] < by_text[row["rejected"]]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ('{"prompt": "p", "chosen": "a"}', "row 2: column 'rejected': expected a string, got 'nothing'"),
+        ('{"prompt": "p", "chosen": NaN, "rejected": "b"}', "row 2: NaN is not a value"),
+        ('{"prompt": "p", "chosen": 3, "rejected": "b"}', "row 2: column 'chosen': expected a string, got 3"),
+        ('{"prompt": "p", "chosen": "a", "rejected": "a"}', "row 2: chosen and rejected are the same"),
+        ("[1]", "row 2: expected an object"),
+        ("{", "row 2:"),
+    ],
+)
+def test_a_bad_row_is_named_and_nothing_is_imported(
+    text_store: Store[Response], tmp_path: Path, row: str, message: str
+) -> None:
+    path = tmp_path / "bad.jsonl"
+    path.write_text(lines(GOOD) + row + "\n" + lines(GOOD))
+    with pytest.raises(ValueError) as caught:
+        import_preferences(path, text_store)
+    assert message in str(caught.value)
+    assert text_store.counts()["asked"] == 0
+
+
+def test_many_bad_rows_are_cut_at_twenty_and_an_empty_file_is_an_error(
+    text_store: Store[Response], tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.jsonl"
+    path.write_text("{}\n" * 50)
+    with pytest.raises(ValueError, match="and 30 more"):
+        import_preferences(path, text_store)
+    path.write_text("")
+    with pytest.raises(ValueError, match="at least one row"):
+        import_preferences(path, text_store)
+
+
+def test_a_contradiction_is_kept_as_two_judgements(text_store: Store[Response], tmp_path: Path) -> None:
+    path = tmp_path / "in.jsonl"
+    path.write_text(lines(GOOD, {"prompt": "p", "chosen": "no", "rejected": "yes"}))
+    import_preferences(path, text_store)
+    judgements = [j.judgement for j in text_store.judged()]
+    assert sorted(j.preference for j in judgements if isinstance(j, Comparison)) == [0.0, 1.0]
+    assert {j.labeler for j in judgements} == {"file", "file#2"}
+
+
+def test_a_bundle_loses_nothing(
+    store: Store[Segment], make_query: Callable[..., Query[Segment]], tmp_path: Path
+) -> None:
+    queries = [make_query(0.0, 1.0), make_query(2.0, 3.0), make_query(0.0, 1.0, 2.0)]
+    store.ask(queries)
+    store.answer([Comparison(queries[0].id, 0.3, "a", (1, 0)), Ranking(queries[2].id, (0, 0, 1), "b")])
+    store.answer([Skip(queries[1].id, "incomparable", "a")])
+    store.retract(queries[0].id, "a")
+    store.answer([Comparison(queries[0].id, 0.9, "a")])
+    export_bundle(store, tmp_path / "bundle")
+    with Store[Segment](tmp_path / "copy") as copy:
+        assert import_bundle(tmp_path / "bundle", copy) == 4
+        assert import_bundle(tmp_path / "bundle", copy) == 4  # again: nothing changes
+        assert copy.events() == store.events()
+        assert copy.answers() == store.answers()
+        assert [q.id for q in copy.open_queries()] == [q.id for q in store.open_queries()]
+    assert not (tmp_path / "copy/gold").exists()
+
+
+@pytest.mark.parametrize("damage", ["blob", "events", "foreign", "path"])
+def test_a_damaged_or_hostile_bundle_is_refused_whole(
+    store: Store[Segment], make_query: Callable[..., Query[Segment]], tmp_path: Path, damage: str
+) -> None:
+    store.ask([query := make_query()])
+    store.answer([Comparison(query.id, 1.0, "a")])
+    bundle = tmp_path / "bundle"
+    export_bundle(store, bundle)
+    events = bundle / "events.jsonl"
+    if damage == "blob":
+        next(bundle.rglob("*.safetensors")).write_bytes(b"")
+    if damage == "events":
+        events.write_text(events.read_text()[:-5])
+    if damage in ("foreign", "path"):
+        old, new = (query.id, "f" * 64) if damage == "foreign" else (query.candidates[0].id, "../../secret")
+        events.write_text(events.read_text().replace(old, new))
+        (bundle / "MANIFEST.json").write_text("{}")
+    with Store[Segment](tmp_path / "copy") as copy:
+        with pytest.raises(ValueError):
+            import_bundle(bundle, copy)
+        assert copy.counts()["asked"] == 0
+
+
+def test_segments_do_not_fit_text_columns_and_the_error_says_what_does(
+    store: Store[Segment], make_query: Callable[..., Query[Segment]], tmp_path: Path
+) -> None:
+    store.ask([query := make_query()])
+    store.answer([Comparison(query.id, 1.0)])
+    with pytest.raises(StoreError, match="--form bundle"):
+        export_preferences(store, tmp_path / "out.jsonl")

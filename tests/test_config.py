@@ -1,0 +1,107 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from prefrl import Config
+from prefrl.components import ConfigError, settings_class
+from prefrl.config import presets
+
+TOY = "control/toy"
+
+
+@pytest.mark.parametrize("name", presets())
+def test_every_preset_loads_says_what_it_shows_and_round_trips(name: str) -> None:
+    config = Config.load(name)
+    assert Config.parse(yaml.safe_load(config.dump())) == config
+    assert len(presets()[name]) > 20
+
+
+def test_a_dumped_config_spells_out_every_default(tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(Config.load(TOY).dump())
+    data = yaml.safe_load(path.read_text())
+    assert data["labeler"] == {"kind": "oracle", "error_rate": 0.0, "tie_within": 0.0}
+    assert Config.load(path) == Config.load(TOY)
+
+
+def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:
+    by_override = Config.load(TOY, ["loop.labels=12", "fitting.learning_rate=1e-4", "seed=3"])
+    preset = Config.load(TOY)
+    by_hand = Config(
+        task=preset.task,
+        reward=preset.reward,
+        learner=preset.learner,
+        fitting=preset.fitting.model_copy(update={"learning_rate": 1e-4}),
+        loop=preset.loop.model_copy(update={"labels": 12}),
+        seed=3,
+    )
+    assert by_override == by_hand
+
+
+def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:
+    assert Config.load(TOY, ["learner.kind=sb3"]).learner == settings_class("learners", "sb3")()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("learner.learning_rat=1", "learner.learning_rat: unknown setting; did you mean 'learning_rate'?"),
+        ("learner.learning_rate=-1", "learner.learning_rate: expected greater than 0, got -1"),
+        ("learner.learning_rate=fast", "learner.learning_rate: expected"),
+        ("learner.learning_rate=.nan", "learner.learning_rate: expected a finite number, got nan"),
+        ("learner.kind=ppoo", "learner.kind: unknown learner kind 'ppoo'; did you mean 'ppo'?"),
+        ("loop.lables=3", "loop.lables: unknown setting; did you mean 'labels'?"),
+        ("lop.labels=3", "lop: unknown setting; did you mean 'loop'?"),
+        ("task=5", "task: expected settings with a kind"),
+        ("seed.x=5", "seed.x: seed is a value"),
+        ("seed", "expected dotted.key=value"),
+        ("seed=[", "is not a YAML value"),
+    ],
+)
+def test_a_wrong_setting_gets_one_line_that_helps(override: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Config.load(TOY, ["seed=1", override])
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_mistake_is_named() -> None:
+    with pytest.raises(ConfigError) as caught:
+        Config.load(TOY, ["learner.epochs=0", "learner.clip=-1", "loop.rounds=0"])
+    assert [line.split(":")[0] for line in str(caught.value).splitlines()] == [
+        "learner.epochs",
+        "learner.clip",
+        "loop.rounds",
+    ]
+
+
+def test_an_unknown_preset_gets_the_nearest_name() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'control/pendulum'"):
+        Config.load("control/pendlum")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task: {kind: control}\ntask: {kind: reviews}\n", "'task' is given twice"),
+        ("task: [", "not valid YAML"),
+        ("just words", "expected settings"),
+        ("task: !!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("task: {kind: 'os:system'}\nreward: {kind: mlp}\nlearner: {kind: ppo}", "unknown task kind"),
+    ],
+)
+def test_a_bad_file_is_refused_and_runs_no_code(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        Config.load(path)
+
+
+def test_a_missing_extra_names_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(_: str) -> object:
+        raise ModuleNotFoundError("No module named 'stable_baselines3'", name="stable_baselines3")
+
+    monkeypatch.setattr("prefrl.components.import_module", absent)
+    with pytest.raises(ConfigError, match=r"pip install 'prefrl\[control\]'"):
+        settings_class("learners", "sb3")

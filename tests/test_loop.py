@@ -1,0 +1,205 @@
+"""The loop end to end on the toy presets: every claim holds for control and for text."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from prefrl import Config
+from prefrl.config import presets
+from prefrl.loop import Loop, LoopSettings
+from prefrl.stages import shrink
+from prefrl.store import Store
+from prefrl.types import Answer, Comparison, Ranking, Skip
+
+TOYS = ["control/toy", "text/toy"]
+
+
+def build(name: str, folder: Path, *overrides: str) -> Loop[Any]:
+    store: Store[Any] = Store(folder)
+    return Config.load(name, overrides).build(store)
+
+
+def leaves(state: Any) -> Iterator[bytes]:
+    """Every array of a nested state as bytes."""
+    if isinstance(state, dict):
+        for key in state:
+            if key != "gold":  # carried along in recent rollouts, for the oracle
+                yield from leaves(state[key])
+    elif isinstance(state, list | tuple):
+        for value in state:
+            yield from leaves(value)
+    elif isinstance(state, torch.Tensor):
+        yield state.detach().numpy().tobytes()
+    elif isinstance(state, np.ndarray):
+        yield state.tobytes()
+    else:
+        yield repr(state).encode()
+
+
+def learned(loop: Loop[Any]) -> list[bytes]:
+    """All that was learned: the weights of the reward model and of the policy, the optimiser's state."""
+    return [*leaves(loop.reward.state()), *leaves(loop.learner.state())]
+
+
+@pytest.mark.parametrize("name", presets())
+def test_every_preset_runs_a_small_round(name: str, tmp_path: Path) -> None:
+    with Store[Any](tmp_path) as store:
+        loop = shrink(Config.load(name)).build(store)
+        rounds = list(loop.run())
+    assert [r.number for r in rounds] == [0, 1]
+    assert all(np.isfinite(r.metrics["evaluate/gold"]) for r in rounds)
+    assert rounds[1].metrics["label/answered"] > 0
+
+
+@pytest.mark.parametrize("name", TOYS)
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_does_not(name: str, tmp_path: Path) -> None:
+    runs = [build(name, tmp_path / str(i), f"seed={seed}") for i, seed in enumerate((0, 0, 1))]
+    for loop in runs:
+        list(loop.run())
+    a, b, c = (learned(loop) for loop in runs)
+    assert a == b
+    assert a != c
+
+
+class Replay:
+    """Gives the answers that another run's labeler gave; sees no gold."""
+
+    name = "replay"
+
+    def __init__(self, answers: list[Answer]) -> None:
+        self.answers = {a.query: a for a in answers}
+
+    def answer(self, store: Store[Any], rng: np.random.Generator) -> None:
+        store.answer([replace(self.answers[q.id], labeler=self.name) for q in store.open_queries(self.name)])
+
+
+class Blind:
+    """A learner whose every sampled candidate has NaN for gold."""
+
+    def __init__(self, learner: Any) -> None:
+        self._learner = learner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._learner, name)
+
+    def sample(self, count: int, rng: np.random.Generator) -> list[Any]:
+        return [replace(c, gold=np.full_like(c.gold, np.nan)) for c in self._learner.sample(count, rng)]
+
+
+@pytest.mark.parametrize("name", TOYS)
+@pytest.mark.parametrize("select", ["uniform", "disagreement"])
+def test_nothing_that_learns_sees_the_gold(name: str, select: str, tmp_path: Path) -> None:
+    """With every gold value replaced by NaN, the fitted weights and the improved policy are bit-identical."""
+    seeing = build(name, tmp_path / "seeing", f"select.kind={select}")
+    list(seeing.run())
+    blind = build(name, tmp_path / "blind", f"select.kind={select}")
+    hide_gold(blind.task)
+    blind.learner = Blind(blind.learner)
+    blind.labeler = Replay(seeing.store.answers())  # type: ignore[attr-defined]
+    rounds = list(blind.run())
+    assert all(np.isnan(r.metrics["evaluate/gold"]) for r in rounds)
+    assert learned(blind) == learned(seeing)
+
+
+def hide_gold(task: Any) -> None:
+    """Make the task itself give NaN: environments' rewards, or the scorer of texts."""
+    if task.kind == "text":
+        object.__setattr__(task, "gold", lambda responses: np.full(len(responses), np.nan))
+        return
+    make = task.environments
+
+    def environments(count: int) -> Any:
+        made = make(count)
+        step = made.step
+        made.step = lambda actions: (t := step(actions))._replace(rewards=np.full_like(t.rewards, np.nan))
+        return made
+
+    object.__setattr__(task, "environments", environments)
+
+
+def test_every_environment_step_is_counted_once_and_by_purpose(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path)
+    task: Any = loop.task
+    make, counted = task.environments, [0]
+
+    def environments(count: int) -> Any:
+        made = make(count)
+        step = made.step
+
+        def counting(actions: np.ndarray) -> Any:
+            counted[0] += len(actions)
+            return step(actions)
+
+        made.step = counting
+        return made
+
+    object.__setattr__(task, "environments", environments)
+    *_, last = loop.run()
+    spent = [last.metrics[f"steps/{name}"] for name in ("learn", "query", "evaluate")]
+    assert sum(spent) == counted[0]
+    assert all(n > 0 for n in spent)
+
+
+def test_labels_are_asked_up_to_the_budget_and_skips_count(tmp_path: Path) -> None:
+    class Skipper(Replay):
+        def answer(self, store: Store[Any], rng: np.random.Generator) -> None:
+            queries = store.open_queries(self.name)
+            half = [Skip(q.id, "skip", self.name) for q in queries[::2]]
+            store.answer([*half, *(Comparison(q.id, 1.0, self.name) for q in queries[1::2])])
+
+    loop = build("control/toy", tmp_path, "loop.labels=20", "loop.rounds=3")
+    loop.labeler = Skipper([])
+    *_, last = loop.run()
+    assert last.metrics["label/asked"] == 20
+    assert last.metrics["label/answered"] + last.metrics["label/skipped"] == 20
+    assert last.metrics["fit/comparisons"] == last.metrics["label/answered"]
+
+
+def test_without_any_label_the_loop_goes_on_and_learns_nothing(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path)
+    before = list(leaves(loop.reward.state()))
+    loop.labeler = Silent()
+    rounds = list(loop.run())
+    assert rounds[-1].fitted is None
+    assert not any(name.startswith("improve/") for name in rounds[-1].metrics)
+    assert list(leaves(loop.reward.state())) == before
+    assert loop.learner.steps.learn == 0
+
+
+class Silent:
+    name = "nobody"
+
+    def answer(self, store: Store[Any], rng: np.random.Generator) -> None:
+        """People are at lunch."""
+
+
+def test_a_pool_that_is_too_small_says_what_to_change(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path)
+
+    class Lazy(Blind):
+        def sample(self, count: int, rng: np.random.Generator) -> list[Any]:
+            return list(self._learner.sample(count, rng)[:4])
+
+    loop.learner = Lazy(loop.learner)
+    with pytest.raises(ValueError, match=r"raise loop\.pool"):
+        list(loop.run())
+
+
+def test_labels_are_spread_as_the_settings_say() -> None:
+    settings = LoopSettings(rounds=5, labels=100, first_share=0.2)
+    assert [settings.asked_by(n) for n in range(6)] == [0, 20, 40, 60, 80, 100]
+    assert [LoopSettings(rounds=1, labels=7).asked_by(n) for n in range(2)] == [0, 7]
+    assert LoopSettings(rounds=3, labels=10, first_share=1.0).asked_by(1) == 10
+
+
+def test_rankings_of_several_candidates_go_through_the_loop(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path, "select.candidates=3")
+    *_, last = loop.run()
+    judgements = [j.judgement for j in loop.store.judged()]
+    assert all(isinstance(j, Ranking) for j in judgements)
+    assert last.metrics["fit/comparisons"] == 3 * len(judgements)
