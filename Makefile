@@ -13,7 +13,7 @@ demo: .venv/demo
 	@echo "  runs/pendulum/report.html"
 	@echo "  runs/reviews/report.html"
 
-test: lint types layers unit docs
+test: lint types layers unit slow docs
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -119,7 +119,9 @@ def clone(settings: CloningSettings, grammar: Grammar) -> tuple[LlamaForCausalLM
         torch.manual_seed(draw_seed(rng))
         model = make_model(settings, tokenizer)
     batches = _batches(rows, settings.batch_size, rng)
-    optimizer = torch.optim.AdamW(model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True)
+    optimizer = torch.optim.AdamW(
+        model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True
+    )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, len(batches)))
     with _progress(len(batches)) as report:
         for batch in batches:

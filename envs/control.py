@@ -15,7 +15,7 @@ from pydantic import Field
 
 from prefrl.components import ConfigError, Settings, missing, suggest
 from prefrl.envs.fast.classic import CartPole, Pendulum, Vectorised
-from prefrl.envs.fast.wrapped import Wrapped, is_mujoco
+from prefrl.envs.fast.wrapped import Wrapped, is_mujoco, make
 from prefrl.protocols import Environments
 from prefrl.types import Floats, Segment
 
@@ -46,7 +46,7 @@ class ControlSettings(Settings):
 
     def build(self) -> GymnasiumTask:
         """Raises `ConfigError` for an unknown id, spaces that cannot be learned and impossible lengths."""
-        make, probe = self._make()
+        single, probe = self._make()
         horizon, fps = self._horizon(), self._fps(probe)
         observation, action = _observation_box(probe), _action_space(probe)
         probe.close()
@@ -59,7 +59,7 @@ class ControlSettings(Settings):
             action_bounds=None if isinstance(action, Discrete) else _bounds(action),
             fps=fps or 30.0,
             frame_size=self.frame_size,
-            make=partial(_environments, self.env, make, horizon, not self.variable_horizon),
+            make=partial(_environments, self.env, single, horizon, not self.variable_horizon),
         )
 
     def _make(self) -> tuple[Callable[[], gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]:
@@ -68,16 +68,16 @@ class ControlSettings(Settings):
             raise ConfigError(f"task.env: unknown gymnasium environment {self.env!r}; {_nearest(self.env)}")
         options: dict[str, Any] = {"max_episode_steps": self._horizon(), "disable_env_checker": True}
         try:
-            probe = gymnasium.make(self.env, **options)
+            probe = make(self.env, **options)
             accepted = inspect.signature(type(probe.unwrapped).__init__).parameters
             if "terminate_when_unhealthy" in accepted and not self.variable_horizon:
                 options["terminate_when_unhealthy"] = False
-                probe = gymnasium.make(self.env, **options)
+                probe = make(self.env, **options)
         except ModuleNotFoundError as error:
             raise ConfigError(f"task.env={self.env}: {missing(error)}") from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"task.env={self.env}: gymnasium cannot make it: {error}") from error
-        return partial(gymnasium.make, self.env, **options), probe
+        return partial(make, self.env, **options), probe
 
     def _horizon(self) -> int:
         horizon = self.horizon or gymnasium.registry[self.env].max_episode_steps
@@ -135,14 +135,18 @@ class GymnasiumTask:
 
 
 def _environments(
-    name: str, make: Callable[[], gymnasium.Env[Any, Any]], horizon: int, fixed_horizon: bool, count: int
+    name: str, single: Callable[[], gymnasium.Env[Any, Any]], horizon: int, fixed_horizon: bool, count: int
 ) -> Environments:
     """The fastest stepper there is for an environment."""
     if name == "Pendulum-v1":
         return Vectorised(Pendulum(), count, horizon)
     if name in ("CartPole-v0", "CartPole-v1"):
         return Vectorised(CartPole(terminate=not fixed_horizon), count, horizon)
-    return Wrapped(make, count, fixed_horizon)
+    if name in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"):
+        from prefrl.envs.fast.locomotion import Locomotion
+
+        return Locomotion(name, single, count, horizon, fixed_horizon)
+    return Wrapped(single, count, fixed_horizon)
 
 
 def _nearest(name: str) -> str:

@@ -1,20 +1,21 @@
 """prefrl: learn what people prefer, and act on it, for control and for text, with one loop."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from prefrl.types import Batch, Comparison, Query, Ranking, Response, Segment, Skip
 
 if TYPE_CHECKING:
     from prefrl.config import Config as Config
+    from prefrl.rundir import Run as Run
 
 __version__ = "0.1.0"
-__all__ = ["Batch", "Comparison", "Config", "Query", "Ranking", "Response", "Segment", "Skip"]
+__all__ = ["Batch", "Comparison", "Config", "Query", "Ranking", "Response", "Run", "Segment", "Skip"]
+_LATER = {"Config": "prefrl.config", "Run": "prefrl.rundir"}
 
 
 def __getattr__(name: str) -> object:
-    """Load `Config` on first use, so that the vocabulary alone stays light."""
-    if name == "Config":
-        from prefrl.config import Config
-
-        return Config
+    """Load what is heavy on first use, so that the vocabulary alone stays light."""
+    if name in _LATER:
+        return getattr(import_module(_LATER[name]), name)
     raise AttributeError(f"module 'prefrl' has no attribute {name!r}")

@@ -24,6 +24,7 @@ class LoopSettings(Settings):
     """How often, and how much is asked."""
 
     rounds: int = Field(10, ge=1)
+    """Turns of the loop, the evaluation of the starting policy not counted."""
     labels: int = Field(200, ge=0)
     """Queries asked in all rounds together; skipped ones count, they cost a person's time too.
 

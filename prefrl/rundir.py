@@ -18,7 +18,7 @@ from prefrl.config import Config
 from prefrl.evaluate.examples import save_examples
 from prefrl.evaluate.report import write_report
 from prefrl.evaluate.summary import read_metrics, summarise
-from prefrl.files import DamagedError, verify, whole_folder, write_file
+from prefrl.files import MANIFEST, DamagedError, verify, whole_folder, write_file
 from prefrl.loop import Loop
 from prefrl.protocols import RewardModel, Task
 from prefrl.seeding import streams
@@ -202,7 +202,10 @@ def _checkpoints(folder: Path) -> list[Path]:
 def _newest(folder: Path) -> tuple[Path, list[str]]:
     """The newest good checkpoint of a run (or the folder itself, if it is one), and what was wrong with newer ones."""
     damaged = []
-    for checkpoint in _checkpoints(folder) or [folder]:
+    found = _checkpoints(folder) or [folder] * (folder / MANIFEST).exists()
+    if not found:
+        raise RunError(f"{folder} holds neither a run with a checkpoint nor a saved model")
+    for checkpoint in found:
         try:
             verify(checkpoint)
         except DamagedError as error:

@@ -1,9 +1,10 @@
-"""An ensemble of small networks over (observation, action): a reward for each step, and a segment's score as their sum."""
+"""An ensemble of small networks over (observation, action): a reward for each step; a segment's score is their sum."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -38,7 +39,7 @@ class MLPSettings(Settings):
 
 
 class MLPReward:
-    """A `prefrl.protocols.StepRewardModel` (Christiano et al. 2017, section 2.2.3: an ensemble, each member normalised).
+    """A `prefrl.protocols.StepRewardModel`: an ensemble of normalised members (Christiano et al. 2017, section 2.2.3).
 
     A segment's raw score is the sum of its steps' outputs times gain / segment_steps: a constant, so that scores add
     up over steps, while logits, and with them step sizes and error rates, do not depend on how long segments are. It
@@ -49,7 +50,7 @@ class MLPReward:
         self._settings, self._scale_of_sums = settings, settings.gain / task.segment_steps
         sizes = (task.observation_size + task.action_size, *settings.hidden, 1)
         generator = torch.Generator().manual_seed(draw_seed(rng))
-        pairs = list(zip(sizes, sizes[1:], strict=False))
+        pairs = list(pairwise(sizes))
         self._weights = [_uniform((settings.members, i, o), i, generator) for i, o in pairs]
         self._biases = [_uniform((settings.members, 1, o), i, generator) for i, o in pairs]
         self._activation = ACTIVATIONS[settings.activation]
@@ -75,8 +76,9 @@ class MLPReward:
         return stacked
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
-        outputs = self._outputs(stacked["inputs"].flatten(0, 1)).unflatten(1, stacked["mask"].shape)
-        return (outputs * stacked["mask"]).sum(2) * self._scale_of_sums
+        mask = stacked["mask"]
+        outputs = self._outputs(stacked["inputs"].flatten(0, 1)).view(self.members, *mask.shape)
+        return (outputs * mask).sum(2) * self._scale_of_sums
 
     @torch.no_grad()
     def settle(self, stacked: Mapping[str, Tensor]) -> None:
@@ -88,7 +90,7 @@ class MLPReward:
     def member_scores(self, candidates: Sequence[Segment]) -> Floats:
         lengths = [len(c) for c in candidates]
         inputs = torch.cat([_inputs(c.observations, c.actions) for c in candidates])
-        parts = self._member_rewards(inputs).split(lengths, 1)
+        parts = torch.split(self._member_rewards(inputs), lengths, 1)
         return torch.stack([part.sum(1) for part in parts], 1).numpy()
 
     def score(self, candidates: Sequence[Segment]) -> Floats:
@@ -98,7 +100,7 @@ class MLPReward:
     @torch.no_grad()
     def rewards(self, observations: Floats, actions: Floats) -> Floats:
         inputs = _inputs(observations, actions)
-        return self._member_rewards(inputs.flatten(0, 1)).mean(0).unflatten(0, inputs.shape[:2]).numpy()
+        return self._member_rewards(inputs.flatten(0, 1)).mean(0).view(inputs.shape[:2]).numpy()
 
     def state(self) -> State:
         parameters = {name: p.detach().clone() for name, p in self._named()}
@@ -117,7 +119,7 @@ class MLPReward:
         self._shift, self._scale = state["shift"].clone(), state["scale"].clone()
         self._fitted = bool(state["fitted"])
 
-    def _named(self) -> list[tuple[str, Tensor]]:
+    def _named(self) -> list[tuple[str, torch.nn.Parameter]]:
         weights = [(f"weight_{i}", w) for i, w in enumerate(self._weights)]
         return weights + [(f"bias_{i}", b) for i, b in enumerate(self._biases)]
 
@@ -129,7 +131,7 @@ class MLPReward:
         return torch.baddbmm(self._biases[-1], x, self._weights[-1])[:, :, 0]
 
     def _member_rewards(self, inputs: Tensor) -> Tensor:
-        outputs = torch.cat([self._outputs(chunk) for chunk in inputs.split(CHUNK)], 1)
+        outputs = torch.cat([self._outputs(chunk) for chunk in torch.split(inputs, CHUNK)], 1)
         return (outputs - self._shift[:, None]) / self._scale[:, None]
 
     @torch.no_grad()
@@ -139,7 +141,7 @@ class MLPReward:
         std = torch.where(std > 1e-6, std, 1.0)
         if self._fitted:
             weight = self._weights[0] / self._input_std[:, None]
-            self._biases[0] += ((mean - self._input_mean) @ weight)[:, None]
+            self._biases[0].add_(((mean - self._input_mean) @ weight)[:, None])
             self._weights[0].copy_(weight * std[:, None])
         self._input_mean, self._input_std = mean, std
 

@@ -12,15 +12,16 @@ import torch
 from prefrl import Config
 from prefrl.config import presets
 from prefrl.loop import Loop, LoopSettings
+from prefrl.protocols import Store
 from prefrl.stages import shrink
-from prefrl.store import Store
+from prefrl.store import Store as SQLStore
 from prefrl.types import Answer, Comparison, Ranking, Skip
 
 TOYS = ["control/toy", "text/toy"]
 
 
 def build(name: str, folder: Path, *overrides: str) -> Loop[Any]:
-    store: Store[Any] = Store(folder)
+    store: SQLStore[Any] = SQLStore(folder)
     return Config.load(name, overrides).build(store)
 
 
@@ -48,7 +49,7 @@ def learned(loop: Loop[Any]) -> list[bytes]:
 
 @pytest.mark.parametrize("name", presets())
 def test_every_preset_runs_a_small_round(name: str, tmp_path: Path) -> None:
-    with Store[Any](tmp_path) as store:
+    with SQLStore[Any](tmp_path) as store:
         loop = shrink(Config.load(name)).build(store)
         rounds = list(loop.run())
     assert [r.number for r in rounds] == [0, 1]
@@ -95,12 +96,14 @@ class Blind:
 @pytest.mark.parametrize("select", ["uniform", "disagreement"])
 def test_nothing_that_learns_sees_the_gold(name: str, select: str, tmp_path: Path) -> None:
     """With every gold value replaced by NaN, the fitted weights and the improved policy are bit-identical."""
-    seeing = build(name, tmp_path / "seeing", f"select.kind={select}")
-    list(seeing.run())
+    with SQLStore[Any](tmp_path / "seeing") as store:
+        seeing = Config.load(name, [f"select.kind={select}"]).build(store)
+        list(seeing.run())
+        answers = store.answers()
     blind = build(name, tmp_path / "blind", f"select.kind={select}")
     hide_gold(blind.task)
     blind.learner = Blind(blind.learner)
-    blind.labeler = Replay(seeing.store.answers())  # type: ignore[attr-defined]
+    blind.labeler = Replay(answers)
     rounds = list(blind.run())
     assert all(np.isnan(r.metrics["evaluate/gold"]) for r in rounds)
     assert learned(blind) == learned(seeing)

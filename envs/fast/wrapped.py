@@ -17,12 +17,12 @@ from prefrl.types import Floats
 class Wrapped:
     """n gymnasium environments stepped in a loop; implements `prefrl.protocols.Environments`.
 
-    `make` builds one, its time limit included. With `fixed_horizon` a termination raises a ValueError: an episode
+    `build` makes one, its time limit included. With `fixed_horizon` a termination raises a ValueError: an episode
     that ends early tells the reward model and the policy how it was judged (PITFALLS, control 1).
     """
 
-    def __init__(self, make: Callable[[], gymnasium.Env[Any, Any]], count: int, fixed_horizon: bool) -> None:
-        self._envs = [make() for _ in range(count)]
+    def __init__(self, build: Callable[[], gymnasium.Env[Any, Any]], count: int, fixed_horizon: bool) -> None:
+        self._envs = [build() for _ in range(count)]
         self._fixed_horizon = fixed_horizon
         self._discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
 
@@ -48,8 +48,25 @@ class Wrapped:
 
     def _action(self, env: gymnasium.Env[Any, Any], action: Floats) -> Any:
         if not self._discrete:
-            return action.astype(env.action_space.dtype)  # type: ignore[arg-type]
+            return action.astype(env.action_space.dtype)
         return int(action.argmax()) + int(env.action_space.start)  # type: ignore[attr-defined]
+
+
+def make(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
+    """gymnasium.make, but silent about what MuJoCo's compiler finds old-fashioned in gymnasium's own models.
+
+    It would write to stderr and to a log file in the current folder. Raises ModuleNotFoundError without MuJoCo.
+    """
+    if "mujoco" not in str(gymnasium.registry[name].entry_point):
+        return gymnasium.make(name, **options)
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        return gymnasium.make(name, **options)
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:

@@ -8,8 +8,9 @@ from markupsafe import Markup
 
 from prefrl.evaluate import plots
 from prefrl.evaluate.facts import Facts
-from prefrl.evaluate.plots import STAGES, Line
+from prefrl.evaluate.plots import Line
 from prefrl.evaluate.records import Record, whole
+from prefrl.evaluate.summary import STAGES
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ def _learning(record: Record) -> tuple[Card, ...]:
         Card(
             "Do the two agree?",
             plots.path("agreement", learned, gold, ("learned reward", "gold")),
-            "One dot a round, joined in order. Up and to the right is progress; right and down means that the policy "
-            "exploits errors of the reward model.",
+            "One dot a round, joined in order. Up and to the right is progress. Right and down is the mark of a policy "
+            "that exploits errors of the reward model, or of a new fit that moved the scale.",
         ),
     )
 

@@ -17,7 +17,8 @@ from prefrl.protocols import ControlTask, Task
 from prefrl.types import Candidate, Floats, Response, Segment, gold_score
 
 FRAMES = 6
-GAP = 4
+GAP, GREY = 2, 215
+"""Between two frames: pixels, and a shade that is seen on white pictures and on black ones."""
 HEIGHT = 160
 """Pixels. Larger frames are made smaller, so that a report of many strips stays light."""
 
@@ -44,7 +45,7 @@ def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | N
 def strip(frames: np.ndarray, count: int = FRAMES) -> np.ndarray:
     """Evenly spaced frames of (T, H, W, 3) uint8, the first and the last among them, side by side with thin gaps."""
     at = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
-    gap = np.full((frames.shape[1], GAP, 3), 255, np.uint8)
+    gap = np.full((frames.shape[1], GAP, 3), GREY, np.uint8)
     parts = [part for i in at for part in (gap, frames[i])][1:]
     return np.concatenate(parts, axis=1)
 

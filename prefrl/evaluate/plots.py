@@ -8,17 +8,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from prefrl.evaluate.calibration import Bin
+from prefrl.evaluate.summary import STAGES
 
 Series: TypeAlias = Sequence[float | None]
-STAGES = ("sample", "label", "fit", "improve", "evaluate")
 COLOURS = {
     name: f"#0101{i:02x}"
     for i, name in enumerate(("ink", "muted", "rule", "card", "gold", "learned", *STAGES), start=1)
@@ -181,8 +181,8 @@ def _legend(axes: Axes, entries: int) -> None:
 def _svg(name: str, draw: Callable[[Figure], None]) -> Markup:
     """Draw into a figure 4.4 inches wide and give its <svg>, with ids of its own and the page's colours."""
     buffer = io.StringIO()
-    style: Any = STYLE | {"svg.hashsalt": name}
-    with mpl.rc_context(style):
+    own: Any = STYLE | {"svg.hashsalt": name}
+    with style.context(["default", own]):  # a user's matplotlibrc has no say
         figure = Figure(figsize=(4.4, 2.7), layout="constrained", facecolor="none")
         draw(figure)
         for axes in figure.axes:

@@ -140,13 +140,12 @@ def _json(path: Path, kind: type, missing: list[str], why: str) -> Any:
 
 def _rounds(path: Path, missing: list[str]) -> tuple[Json, ...]:
     lines = path.read_bytes().splitlines() if path.is_file() else []
-    found = {}
-    for line in lines:
-        parsed = _line(line)
-        if (at := whole(parsed.get("round"))) is not None:
-            found[at] = parsed
+    parsed = [_line(line) for line in lines]
+    found = {at: row for row in parsed if (at := whole(row.get("round"))) is not None}
     if not found:
         missing.append(f"{path.name}: no round has been evaluated yet")
+    if unread := sum(whole(row.get("round")) is None for row in parsed):
+        missing.append(f"{path.name}: {unread} of its lines cannot be read")
     return tuple(found[at] for at in sorted(found))
 
 

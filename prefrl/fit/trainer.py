@@ -35,6 +35,7 @@ class FittingSettings(Settings):
     batch_size: int = Field(64, ge=1)
     """Comparisons in a gradient step."""
     learning_rate: float = Field(1e-3, gt=0)
+    """AdamW's; it starts anew with every fit."""
     weight_decay: float = Field(0.0, ge=0)
     """AdamW's decoupled weight decay."""
     error_rate: float = Field(0.0, ge=0, lt=1)
@@ -44,6 +45,7 @@ class FittingSettings(Settings):
     bootstrap: bool = True
     """Give each member of an ensemble its own resampling of the training comparisons."""
     max_grad_norm: float = Field(1.0, gt=0)
+    """A gradient that is longer is shortened to this."""
 
 
 def fit(reward: RewardModel[C], store: Store[C], fitting: FittingSettings, rng: np.random.Generator) -> Fitted:

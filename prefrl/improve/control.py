@@ -128,8 +128,8 @@ class PPO:
     """A `prefrl.protocols.Learner` of segments.
 
     Rewards are scored once a rollout, in one batch, and multiplied by sqrt(1 - discount^2): returns, and with them the
-    critic's targets, are then of the order of one for any discount. The normaliser moves between a rollout's last update and
-    the next rollout only, so the probability ratio is exactly 1 before the first gradient step.
+    critic's targets, are then of the order of one for any discount. The normaliser moves between a rollout's last
+    update and the next rollout only, so the probability ratio is exactly 1 before the first gradient step.
     """
 
     def __init__(self, settings: PPOSettings, task: ControlTask, rng: np.random.Generator) -> None:

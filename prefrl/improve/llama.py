@@ -18,8 +18,8 @@ class LlamaDecoder:
 
     @staticmethod
     def fits(model: PreTrainedModel) -> bool:
-        """Is this a plain Llama, whose step is written out here?"""
-        if type(model) is not LlamaForCausalLM:
+        """Is this a plain Llama in float32, whose step is written out here?"""
+        if type(model) is not LlamaForCausalLM or model.dtype != torch.float32:
             return False
         config = model.config
         plain = config.hidden_act == "silu" and not config.attention_bias and not config.mlp_bias

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -83,7 +84,10 @@ class Policy:
         return (1.0 / np.sqrt(self.variance + 1e-8)).astype(np.float32)
 
     def observe(self, observations: Floats) -> None:
-        """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979). Not between acting and learning."""
+        """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979).
+
+        Never between acting and learning: the probability ratio would not start at 1.
+        """
         new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
         total = self.count + len(new)
         delta = new.mean(0) - self.mean
@@ -151,7 +155,7 @@ def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:
 
 def _mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> list[torch.nn.Parameter]:
     net = []
-    for i, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
+    for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         gain = last_gain if i == len(sizes) - 2 else math.sqrt(2)
         weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, generator)
         net += [torch.nn.Parameter(weight), torch.nn.Parameter(torch.zeros(fan_out))]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -41,7 +41,8 @@ class Rollout:
     @property
     def ends(self) -> np.ndarray:
         """(n, T) bool: the episode stopped here."""
-        return np.logical_or(self.terminated, self.truncated)
+        ends: np.ndarray = self.terminated | self.truncated
+        return ends
 
     def state(self) -> State:
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -49,8 +50,9 @@ class Rollout:
 
 def joined(parts: Sequence[Rollout]) -> Rollout:
     """Rollouts that follow one another, as one."""
-    arrays = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Rollout)}
-    return Rollout(**{k: None if v[0] is None else np.concatenate(v, 1) for k, v in arrays.items()})
+    arrays: dict[str, list[Any]] = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Rollout)}
+    whole: dict[str, Any] = {k: None if v[0] is None else np.concatenate(v, 1) for k, v in arrays.items()}
+    return Rollout(**whole)
 
 
 def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> tuple[Rollout, Floats]:
@@ -142,8 +144,9 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
 
 
 def first_rollout(task: ControlTask, envs: Environments, act: Act, count: int, rng: np.random.Generator) -> Rollout:
-    """What a starting policy does: an episode's length of steps in each environment, or more to hold `count` segments."""
-    parts, observations = [], envs.reset(rng)
+    """What a starting policy does: an episode's steps in each environment, or more, so as to hold `count` windows."""
+    parts: list[Rollout] = []
+    observations = envs.reset(rng)
     while True:
         rollout, observations = collect(envs, observations, task.horizon, act)
         parts.append(rollout)
@@ -154,7 +157,8 @@ def first_rollout(task: ControlTask, envs: Environments, act: Act, count: int, r
 def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Generator) -> Rollout:
     """One episode in each of `episodes` fresh environments; a row may go on after its first end."""
     envs = task.environments(episodes)
-    parts, observations, done = [], envs.reset(rng), np.zeros(episodes, bool)
+    parts: list[Rollout] = []
+    observations, done = envs.reset(rng), np.zeros(episodes, bool)
     block = min(task.horizon, 100)
     while not done.all():
         steps = min(block, task.horizon - sum(p.ends.shape[1] for p in parts))
@@ -165,7 +169,7 @@ def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Ge
 
 
 def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
-    """Mean returns over the first episode of each row: `gold`, `gold_std`, `learned`, `length`; and openings to look at."""
+    """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`; and openings to look at."""
     lengths = rollout.ends.argmax(1) + 1
     mask = np.arange(rollout.ends.shape[1]) < lengths[:, None]
     gold = np.where(mask, rollout.gold, 0.0).sum(1)

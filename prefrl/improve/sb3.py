@@ -1,7 +1,7 @@
 """stable-baselines3's algorithms on the learned reward, in the loop or in a script of your own.
 
 In a script: `env = LearnedReward(any_vec_env, reward_model)`, and after each fit of the reward model
-`relabel(model.replay_buffer, reward_model)` where the algorithm keeps a replay buffer. True rewards are then never used.
+`relabel(model.replay_buffer, reward_model)` where the algorithm keeps a replay buffer. True rewards are never used.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class SB3Settings(Settings):
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
     """Environment steps of one round's learning: a multiple of what the algorithm collects between two updates."""
-    options: dict[str, JsonValue] = {}
+    options: dict[str, JsonValue] = Field(default_factory=dict)
     """Arguments of the algorithm (learning_rate, gamma, batch_size, ...), as its own documentation names them."""
-    policy: dict[str, JsonValue] = {}
+    policy: dict[str, JsonValue] = Field(default_factory=dict)
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
     evaluation_episodes: int = Field(20, ge=1)
 
@@ -184,7 +184,8 @@ def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
 def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
     """Actions as a reward model sees them, (n, A) float32: clipped to a box's bounds, one-hot where discrete."""
     if isinstance(space, gymnasium.spaces.Box):
-        return np.clip(actions, space.low, space.high).astype(np.float32)
+        clipped: Floats = np.clip(actions, space.low, space.high).astype(np.float32)
+        return clipped
     if isinstance(space, gymnasium.spaces.Discrete):
         chosen = np.asarray(actions).reshape(-1).astype(np.int64) - int(space.start)
         return np.eye(int(space.n), dtype=np.float32)[chosen]
@@ -224,7 +225,7 @@ class SB3:
         return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
-        """`steps_per_round` environment steps of learning, from fresh episodes; replayed rewards are recomputed first."""
+        """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
         self._learned.learned, before = step_rewards(reward), self._env.steps
         if isinstance(self.model, SAC):
             relabel(self.model.replay_buffer, step_rewards(reward))

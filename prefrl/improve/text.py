@@ -117,7 +117,7 @@ class TextLearner:
         self.model = task.model()
         self._reference = task.model().requires_grad_(False)
         check_head(self.model)
-        self._optimizer = torch.optim.Adam(self.model.parameters(), settings.learning_rate, eps=1e-5)
+        self._optimizer = torch.optim.Adam(self.model.parameters(), settings.learning_rate, eps=1e-5, fused=True)
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._steps, self._updates = Steps(), 0
 

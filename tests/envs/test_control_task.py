@@ -71,13 +71,14 @@ def test_episodes_may_end_early_when_asked_to() -> None:
     assert any(envs.step(np.array([[1.0, 0.0]], np.float32)).terminated.all() for _ in range(30))
 
 
-def test_cartpole_that_fell_earns_nothing_and_goes_on() -> None:
+def test_a_cartpole_that_fell_earns_nothing_and_stays_as_it_fell() -> None:
     task = ControlSettings(env="CartPole-v1", segment_steps=5).build()
     envs = task.environments(1)
     envs.reset(np.random.default_rng(0))
-    gold = [float(envs.step(np.array([[1.0, 0.0]], np.float32)).rewards[0]) for _ in range(20)]
-    assert gold[0] == 1.0
-    assert gold[-1] == 0.0
+    steps = [envs.step(np.array([[1.0, 0.0]], np.float32)) for _ in range(20)]
+    assert steps[0].rewards[0] == 1.0
+    assert steps[-1].rewards[0] == 0.0
+    assert np.array_equal(steps[-1].observations, steps[-2].observations)
 
 
 def test_an_environment_without_a_time_limit_needs_a_horizon() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from prefrl.evaluate.examples import GAP, save_examples, strip
+from prefrl.evaluate.examples import GAP, GREY, save_examples, strip
 from prefrl.evaluate.records import read
 from prefrl.types import Response, Segment
 
@@ -40,7 +40,7 @@ def test_a_strip_shows_the_first_and_the_last_frame_and_gaps_between() -> None:
     joined = strip(frames, 6)
     assert joined.shape == (4, 6 * 5 + 5 * GAP, 3)
     assert [int(joined[0, i * (5 + GAP), 0]) for i in range(6)] == [0, 2, 4, 6, 8, 10]
-    assert (joined[:, 5 : 5 + GAP] == 255).all()
+    assert (joined[:, 5 : 5 + GAP] == GREY).all()
 
 
 def test_a_short_clip_repeats_no_frame() -> None:

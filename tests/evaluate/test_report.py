@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 from PIL import Image
 
@@ -153,6 +154,7 @@ def test_a_run_still_going_on_says_so(tmp_path: Path) -> None:
     assert "Gold rose from −100 to −80 so far, in 2 rounds (20 labels, 2,070 environment steps" in found.text
     assert "not finished: round 2 of 3" in found.text
     assert "summary.json: no round is over yet" in found.text
+    assert "metrics.jsonl: 1 of its lines cannot be read" in found.text
     assert "after.json: no examples yet" in found.text
 
 
@@ -181,7 +183,7 @@ def test_hostile_text_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     assert ("meta", "content", CSP) in found.attributes  # a second lock: no script may run, nothing be loaded
 
 
-@pytest.mark.parametrize("wild", [None, 3, "x", [], {}, [None], True, "[" * 100_000, [[1]], {"total": "x"}])
+@pytest.mark.parametrize("wild", [None, -3, "x", [None], True, "[" * 100_000, {"total": [[1]]}])
 def test_wrong_types_anywhere_never_crash_it(tmp_path: Path, wild: Any) -> None:
     keys = ("gold_before", "rounds", "labels", "steps", "seconds", "versions", "kl", "seed", "task", "kind")
     lines = [{"round": 0} | dict.fromkeys(line(1), wild) | {"round": 0}, line(1), {"round": wild}]
@@ -195,7 +197,7 @@ def test_wrong_types_anywhere_never_crash_it(tmp_path: Path, wild: Any) -> None:
     check_harmless(page(folder))
 
 
-@pytest.mark.parametrize("value", [-1e308, 9e14, float("inf"), 10**400, 1e-300, 0])
+@pytest.mark.parametrize("value", [-1e308, 9e14, 10**400, 1e-300])
 def test_wild_numbers_never_crash_it(tmp_path: Path, value: float) -> None:
     keys = [key for key in line(1) if key != "round"]
     lines = [{"round": i} | dict.fromkeys(keys, value) for i in range(2)] + [line(2)]
@@ -228,7 +230,8 @@ def test_the_same_folder_gives_the_same_bytes_and_leaves_nothing_behind(tmp_path
     folder = whole_run(tmp_path / "run")
     before = {path.name for path in folder.iterdir()}
     first = write_report(folder).read_bytes()
-    assert write_report(folder).read_bytes() == first
+    with matplotlib.rc_context({"text.usetex": True, "font.size": 30}):  # as in somebody's matplotlibrc
+        assert write_report(folder).read_bytes() == first
     assert {path.name for path in folder.iterdir()} == before | {"report.html"}
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from control_stubs import Known, point
 from pydantic import ValidationError
 
 from prefrl.checkpoints import load_state, save_state
@@ -21,7 +20,6 @@ from prefrl.reward_models.mlp import MLPSettings
 from prefrl.store import Store
 from prefrl.types import Segment, Steps
 
-Make = Callable[..., GymnasiumTask]
 SMALL: dict[str, Any] = {
     "environments": 4,
     "steps_per_round": 400,
@@ -40,119 +38,114 @@ def _learner(task: GymnasiumTask, seed: int = 0, **settings: object) -> PPO:
 
 def _bytes(learner: PPO) -> bytes:
     state = learner.policy.state()
-    return b"".join(p.numpy().tobytes() for p in state["parameters"].values()) + state["mean"].tobytes()
+    arrays = [*(p.numpy() for p in state["parameters"].values()), state["mean"], state["variance"]]
+    return b"".join(a.tobytes() for a in arrays)
 
 
 @pytest.mark.parametrize("discrete", [False, True])
-def test_it_learns_to_stay_at_the_origin(point: Make, known: Any, store: Store[Segment], discrete: bool) -> None:
-    learner = _learner(point(discrete), steps_per_round=2400, epochs=10, discount=0.9, hidden=(16, 16))
-    before = learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"]
+def test_it_learns_to_stay_at_the_origin(store: Store[Segment], discrete: bool) -> None:
+    learner = _learner(point(discrete), seed=3, steps_per_round=2400, epochs=10, discount=0.9, hidden=(16, 16))
+    before = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
     for number in range(4):
-        learner.improve(known(), store, np.random.default_rng(number))
-    after = learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"]
+        learner.improve(Known(), store, np.random.default_rng(number))
+    after = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
+    # What it takes to come there from a uniform start, and 0.1 a step beside it where pushes have one size.
     assert before < -8.0
-    # What it takes to come here from a uniform start, and 0.1 a step beside it where pushes have one size.
-    assert after > (-4.0 if discrete else -3.0)
+    assert after > (-3.0 if discrete else -1.5)
 
 
-def test_reinforce_is_a_choice_of_settings_and_learns_too(point: Make, known: Any, store: Store[Segment]) -> None:
+def test_reinforce_is_a_choice_of_settings_and_learns_too(store: Store[Segment]) -> None:
     learner = _learner(
         point(), clip=None, epochs=1, trace=1.0, discount=0.9, minibatch=160, steps_per_round=4800, learning_rate=3e-3
     )
-    before = learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"]
+    before = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
     for number in range(3):
-        learner.improve(known(), store, np.random.default_rng(number))
-    assert learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"] > before + 3.0
+        learner.improve(Known(), store, np.random.default_rng(number))
+    assert learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"] > before + 3.0
 
 
-def test_every_step_of_the_environments_is_counted_once_by_purpose(
-    point: Make, known: Any, store: Store[Segment]
-) -> None:
+def test_every_step_of_the_environments_is_counted_once_by_purpose(store: Store[Segment]) -> None:
     spent: list[int] = []
     learner = _learner(point(spent=spent))
     learner.sample(10, np.random.default_rng(0))
     assert (sum(spent), learner.steps) == (80, Steps(query=80))
-    learner.improve(known(), store, np.random.default_rng(1))
+    learner.improve(Known(), store, np.random.default_rng(1))
     assert (sum(spent), learner.steps) == (480, Steps(learn=400, query=80))
     learner.sample(10, np.random.default_rng(2))
     assert sum(spent) == 480
-    learner.evaluate(known(), np.random.default_rng(3))
+    learner.evaluate(Known(), np.random.default_rng(3))
     assert (sum(spent), learner.steps) == (540, Steps(learn=400, query=80, evaluate=60))
 
 
 @pytest.mark.parametrize("rollout_steps", [7, 30, 64, 1000])
-def test_a_round_takes_exactly_its_steps_however_long_rollouts_are(
-    point: Make, known: Any, store: Store[Segment], rollout_steps: int
-) -> None:
+def test_a_round_takes_exactly_its_steps_however_long_rollouts_are(store: Store[Segment], rollout_steps: int) -> None:
     learner = _learner(point(), rollout_steps=rollout_steps)
-    learner.improve(known(), store, np.random.default_rng(0))
+    learner.improve(Known(), store, np.random.default_rng(0))
     assert learner.steps.learn == 400
 
 
-def test_segments_carry_gold_states_and_names_that_are_unique_in_the_run(
-    point: Make, known: Any, store: Store[Segment]
-) -> None:
+def test_segments_carry_gold_states_and_names_that_are_unique_in_the_run(store: Store[Segment]) -> None:
     learner = _learner(point())
     pools = []
     for number in range(3):
         pools.append(learner.sample(20, np.random.default_rng(number)))
-        learner.improve(known(), store, np.random.default_rng(number))
+        learner.improve(Known(), store, np.random.default_rng(number))
     segments = [s for pool in pools for s in pool]
     assert len({s.id for s in segments}) == 60
     assert not {s.episode for s in pools[0]} & {s.episode for s in pools[1]}
     assert all(s.gold is not None and s.states is not None and len(s.gold) == len(s) == 5 for s in segments)
 
 
-def test_gold_never_touches_what_is_learned(point: Make, known: Any, store: Store[Segment]) -> None:
+def test_gold_never_touches_what_is_learned(store: Store[Segment]) -> None:
     learners = [_learner(point(hide_gold=hide)) for hide in (False, True)]
     for learner in learners:
         learner.sample(10, np.random.default_rng(5))
-        learner.improve(known(), store, np.random.default_rng(0))
+        learner.improve(Known(), store, np.random.default_rng(0))
     assert _bytes(learners[0]) == _bytes(learners[1])
-    gold = learners[1].evaluate(known(), np.random.default_rng(0)).metrics
+    gold = learners[1].evaluate(Known(), np.random.default_rng(0)).metrics
     assert np.isnan(gold["gold"])
     assert np.isfinite(gold["learned"])
 
 
-def test_same_seed_gives_equal_bytes_and_another_does_not(point: Make, known: Any, store: Store[Segment]) -> None:
+def test_same_seed_gives_equal_bytes_and_another_does_not(store: Store[Segment]) -> None:
     found = []
     for seed in (0, 0, 1):
         learner = _learner(point())
-        learner.improve(known(), store, np.random.default_rng(seed))
+        learner.improve(Known(), store, np.random.default_rng(seed))
         found.append(_bytes(learner))
     assert found[0] == found[1] != found[2]
 
 
-def test_a_saved_learner_goes_on_bit_for_bit(point: Make, known: Any, store: Store[Segment], tmp_path: Any) -> None:
+def test_a_saved_learner_goes_on_bit_for_bit(store: Store[Segment], tmp_path: Any) -> None:
     learner = _learner(point())
-    learner.improve(known(), store, np.random.default_rng(0))
+    learner.improve(Known(), store, np.random.default_rng(0))
     save_state(tmp_path, "learner", learner.state())
     other = _learner(point(), seed=7)
     other.load(load_state(tmp_path, "learner"))
     pools = [one.sample(10, np.random.default_rng(1)) for one in (learner, other)]
     assert [s.id for s in pools[0]] == [s.id for s in pools[1]]
     for one in (learner, other):
-        one.improve(known(), store, np.random.default_rng(2))
+        one.improve(Known(), store, np.random.default_rng(2))
     assert _bytes(learner) == _bytes(other)
     assert learner.steps == other.steps
 
 
-def test_the_probability_ratio_is_one_before_the_first_step(point: Make, known: Any, store: Store[Segment]) -> None:
+def test_the_probability_ratio_is_one_before_the_first_step(store: Store[Segment]) -> None:
     learner = _learner(point(), minibatch=160, epochs=1, rollout_steps=40, target_kl=None)
-    learner.improve(known(), store, np.random.default_rng(0))
-    metrics = learner.improve(known(), store, np.random.default_rng(1))
+    learner.improve(Known(), store, np.random.default_rng(0))
+    metrics = learner.improve(Known(), store, np.random.default_rng(1))
     assert abs(metrics["kl_old"]) < 1e-9
     assert metrics["clipped"] == 0.0
 
 
-def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_does_not(point: Make) -> None:
+def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_does_not() -> None:
     learner = _learner(point())
     ones = np.ones((1, 4, 1), np.float32)
     rollout = Rollout(
-        observations=ones * np.float32([[[0.1], [0.2], [0.3], [0.4]]]),
+        observations=ones * np.array([[[0.1], [0.2], [0.3], [0.4]]], np.float32),
         choices=ones,
         actions=ones,
-        final_observations=ones * np.float32([[[0.2], [0.8], [0.9], [0.5]]]),
+        final_observations=ones * np.array([[[0.2], [0.8], [0.9], [0.5]]], np.float32),
         terminated=np.array([[False, False, True, False]]),
         truncated=np.array([[False, True, False, False]]),
         gold=np.zeros((1, 4)),
@@ -162,27 +155,31 @@ def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_do
         policy = learner.policy
         values = policy.values(torch.from_numpy(policy.normalise(rollout.observations)))
         found = learner._next_values(rollout, values)
-        value = lambda x: policy.values(torch.from_numpy(policy.normalise(np.float32([[x]])))).item()  # noqa: E731
+
+        def value(x: float) -> float:
+            inputs = torch.from_numpy(policy.normalise(np.array([[x]], np.float32)))
+            return float(policy.values(inputs).detach())
+
     assert found[0].tolist() == pytest.approx([value(0.2), value(0.8), 0.0, value(0.5)], abs=1e-6)
 
 
-def test_evaluation_does_not_depend_on_what_was_drawn_before(point: Make, known: Any) -> None:
+def test_evaluation_does_not_depend_on_what_was_drawn_before() -> None:
     learner = _learner(point())
-    first = learner.evaluate(known(), np.random.default_rng(0))
+    first = learner.evaluate(Known(), np.random.default_rng(0))
     learner.sample(10, np.random.default_rng(1))
-    second = learner.evaluate(known(), np.random.default_rng(0))
+    second = learner.evaluate(Known(), np.random.default_rng(0))
     assert first.metrics == second.metrics
     assert [s.id for s in first.examples] == [s.id for s in second.examples]
     assert len(first.examples) == 3
 
 
-def test_a_reward_that_is_nan_stops_the_round_and_is_named(point: Make, known: Any, store: Store[Segment]) -> None:
-    broken = known(lambda o, a: np.where(o[..., 0] > 0.5, np.nan, o[..., 0]))
+def test_a_reward_that_is_nan_stops_the_round_and_is_named(store: Store[Segment]) -> None:
+    broken = Known(lambda o, a: np.where(o[..., 0] > 0.5, np.nan, o[..., 0]))
     with pytest.raises(FloatingPointError, match=r"learned reward of environment \d+, step \d+"):
         _learner(point()).improve(broken, store, np.random.default_rng(0))
 
 
-def test_it_learns_from_a_fitted_ensemble(point: Make, store: Store[Segment]) -> None:
+def test_it_learns_from_a_fitted_ensemble(store: Store[Segment]) -> None:
     task = point()
     learner = _learner(task)
     reward = MLPSettings(hidden=(8,)).build(task, np.random.default_rng(0))
@@ -197,7 +194,7 @@ def test_steps_that_do_not_divide_are_refused_with_both_numbers() -> None:
         PPOSettings(steps_per_round=1000)
 
 
-def test_a_text_task_is_refused(point: Make) -> None:
+def test_a_text_task_is_refused() -> None:
     class Text:
         name, kind = "reviews", "text"
 
@@ -205,7 +202,7 @@ def test_a_text_task_is_refused(point: Make) -> None:
         PPOSettings().build(Text(), np.random.default_rng(0))
 
 
-def test_a_reward_model_without_step_rewards_is_refused(point: Make, store: Store[Segment]) -> None:
+def test_a_reward_model_without_step_rewards_is_refused(store: Store[Segment]) -> None:
     class Whole:
         members, fitted = 1, True
 
@@ -218,7 +215,7 @@ def test_the_formula_says_what_is_optimised() -> None:
     assert "log pi(a|s) A" in PPOSettings(clip=None).formula()
 
 
-def test_the_learning_rate_follows_the_kl(point: Make) -> None:
+def test_the_learning_rate_follows_the_kl() -> None:
     learner = _learner(point(), target_kl=0.01, learning_rate=1e-3)
     group = learner._optimizer.param_groups[0]
     learner._steer(0.05)
@@ -228,5 +225,3 @@ def test_the_learning_rate_follows_the_kl(point: Make) -> None:
     for _ in range(20):
         learner._steer(0.0)
     assert group["lr"] == pytest.approx(1e-2)
-    fixed = replace(learner._task)
-    assert _learner(fixed, target_kl=None)._settings.target_kl is None

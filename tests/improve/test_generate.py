@@ -38,7 +38,7 @@ def _loud(model: PreTrainedModel) -> PreTrainedModel:
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for p in model.parameters():
-            p += torch.randn(p.shape, generator=generator) * (0.3 if p.ndim == 2 else 0.1)
+            p.add_(torch.randn(p.shape, generator=generator), alpha=0.3 if p.ndim == 2 else 0.1)
     model.eval()  # type: ignore[no-untyped-call]
     return model
 
@@ -71,7 +71,9 @@ def test_left_padding_changes_nothing(make: Callable[[], PreTrainedModel]) -> No
     uniform = torch.rand(len(PROMPTS), 8, generator=torch.Generator().manual_seed(0))
     for i, prompt in enumerate(PROMPTS):
         logp = _one_by_one(model, prompt, together.tokens[i])
-        torch.testing.assert_close(together.logp[i], logp.gather(1, together.tokens[i, :, None])[:, 0], atol=2e-5, rtol=0)
+        torch.testing.assert_close(
+            together.logp[i], logp.gather(1, together.tokens[i, :, None])[:, 0], atol=2e-5, rtol=0
+        )
         tokens, _ = draw(logp, uniform[i], 1.0)
         assert tokens.tolist() == together.tokens[i].tolist()
 

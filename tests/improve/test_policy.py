@@ -37,14 +37,14 @@ def test_densities_and_entropies_are_those_of_torch_distributions() -> None:
     inputs, choices = torch.randn(7, 3), torch.randn(7, 1)
     logp, entropy = policy.log_prob(inputs, choices)
     normal = torch.distributions.Normal(forward(policy.actor, inputs), policy.log_std.exp())
-    torch.testing.assert_close(logp, normal.log_prob(choices).sum(1))
-    torch.testing.assert_close(entropy, normal.entropy().sum(1))
+    torch.testing.assert_close(logp, normal.log_prob(choices).sum(1))  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(entropy, normal.entropy().sum(1))  # type: ignore[no-untyped-call]
 
 
 def test_categorical_choices_follow_their_probabilities() -> None:
     policy = _policy("CartPole-v1")
     policy.actor[-1].data = torch.tensor([0.0, 1.5])
-    observations = np.tile(np.float32([0.1, 0.2, 0.0, -0.1]), (20_000, 1))
+    observations = np.tile(np.array([0.1, 0.2, 0.0, -0.1], np.float32), (20_000, 1))
     choices, actions = policy.act(observations, np.random.default_rng(0))
     logp, entropy = policy.log_prob(torch.from_numpy(policy.normalise(observations[:2])), torch.eye(2))
     assert choices is actions
@@ -70,8 +70,10 @@ def test_the_normaliser_has_the_mean_and_variance_of_all_it_observed() -> None:
 
 
 def test_unbounded_actions_are_left_alone() -> None:
-    space = ActionSpace(2, np.float32([0, 1]), np.float32([1, 3]), np.float32([np.inf, 1]))
-    assert space.execute(np.float32([[50.0, -9.0]])).tolist() == [[50.0, -2.0]]
+    space = ActionSpace(
+        2, np.array([0, 1], np.float32), np.array([1, 3], np.float32), np.array([np.inf, 1], np.float32)
+    )
+    assert space.execute(np.array([[50.0, -9.0]], np.float32)).tolist() == [[50.0, -2.0]]
 
 
 def test_state_and_load_give_the_same_policy() -> None:

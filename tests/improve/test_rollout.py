@@ -67,7 +67,7 @@ def test_a_segment_is_the_rollouts_own_steps_by_value_with_gold_and_states() -> 
 
 
 def test_more_segments_than_there_are_is_an_error_with_both_numbers() -> None:
-    with pytest.raises(ValueError, match="hold 22 segments of 3 steps.*but 23"):
+    with pytest.raises(ValueError, match=r"hold 22 segments of 3 steps.*but 23"):
         cut(_rollout(), 3, 23, "round 0", np.random.default_rng(0))
     with pytest.raises(ValueError, match="hold 0 segments"):
         cut(_rollout(2), 3, 1, "round 0", np.random.default_rng(0))

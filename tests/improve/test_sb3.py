@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC
+from control_stubs import Known, point
 from stable_baselines3 import PPO as SB3PPO
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -23,7 +23,6 @@ from prefrl.reward_models.mlp import MLPSettings
 from prefrl.store import Store
 from prefrl.types import Segment, Steps
 
-Make = Callable[..., GymnasiumTask]
 NET = {"net_arch": [8]}
 PPO: dict[str, Any] = {"algorithm": "PPO", "options": {"n_steps": 20, "n_epochs": 2, "batch_size": 40}}
 SAC_: dict[str, Any] = {
@@ -44,15 +43,15 @@ def _bytes(learner: SB3) -> bytes:
 
 @both
 def test_every_step_of_the_environments_is_counted_once_by_purpose(
-    point: Make, known: Any, store: Store[Segment], algorithm: dict[str, Any]
+    store: Store[Segment], algorithm: dict[str, Any]
 ) -> None:
     spent: list[int] = []
     learner = _learner(point(spent=spent), algorithm)
     learner.sample(10, np.random.default_rng(0))
     assert (sum(spent), learner.steps) == (40, Steps(query=40))
-    learner.improve(known(), store, np.random.default_rng(1))
+    learner.improve(Known(), store, np.random.default_rng(1))
     assert (sum(spent), learner.steps) == (120, Steps(learn=80, query=40))
-    learner.evaluate(known(), np.random.default_rng(3))
+    learner.evaluate(Known(), np.random.default_rng(3))
     assert (sum(spent), learner.steps) == (180, Steps(learn=80, query=40, evaluate=60))
     segments = learner.sample(10, np.random.default_rng(2))
     assert sum(spent) == 180
@@ -60,86 +59,78 @@ def test_every_step_of_the_environments_is_counted_once_by_purpose(
 
 
 @both
-def test_gold_never_touches_what_is_learned(
-    point: Make, known: Any, store: Store[Segment], algorithm: dict[str, Any]
-) -> None:
+def test_gold_never_touches_what_is_learned(store: Store[Segment], algorithm: dict[str, Any]) -> None:
     learners = [_learner(point(hide_gold=hide), algorithm) for hide in (False, True)]
     for learner in learners:
         for number in range(2):
-            learner.improve(known(), store, np.random.default_rng(number))
+            learner.improve(Known(), store, np.random.default_rng(number))
     assert _bytes(learners[0]) == _bytes(learners[1])
 
 
 @both
-def test_a_saved_learner_goes_on_bit_for_bit(
-    point: Make, known: Any, store: Store[Segment], algorithm: dict[str, Any], tmp_path: Any
-) -> None:
+def test_a_saved_learner_goes_on_bit_for_bit(store: Store[Segment], algorithm: dict[str, Any], tmp_path: Any) -> None:
     learner = _learner(point(), algorithm)
     for number in range(2):
-        learner.improve(known(), store, np.random.default_rng(number))
+        learner.improve(Known(), store, np.random.default_rng(number))
     save_state(tmp_path, "learner", learner.state())
     other = _learner(point(), algorithm, seed=7)
     other.load(load_state(tmp_path, "learner"))
     pools = [one.sample(10, np.random.default_rng(1)) for one in (learner, other)]
     assert [s.id for s in pools[0]] == [s.id for s in pools[1]]
     for one in (learner, other):
-        one.improve(known(), store, np.random.default_rng(2))
+        one.improve(Known(), store, np.random.default_rng(2))
     assert _bytes(learner) == _bytes(other)
     assert learner.steps == other.steps
 
 
 @both
-def test_the_global_generators_are_left_as_they_were(
-    point: Make, known: Any, store: Store[Segment], algorithm: dict[str, Any]
-) -> None:
+def test_the_global_generators_are_left_as_they_were(store: Store[Segment], algorithm: dict[str, Any]) -> None:
     torch.manual_seed(3)
     np.random.seed(3)
-    before = torch.get_rng_state(), np.random.get_state()[1]
+    before = torch.get_rng_state(), np.random.get_state(legacy=False)["state"]["key"]
     learner = _learner(point(), algorithm)
     learner.sample(5, np.random.default_rng(0))
-    learner.improve(known(), store, np.random.default_rng(0))
+    learner.improve(Known(), store, np.random.default_rng(0))
     assert torch.equal(torch.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])
+    assert np.array_equal(np.random.get_state(legacy=False)["state"]["key"], before[1])
 
 
-def test_it_learns_to_stay_at_the_origin(point: Make, known: Any, store: Store[Segment]) -> None:
+def test_it_learns_to_stay_at_the_origin(store: Store[Segment]) -> None:
     options = {"n_steps": 100, "batch_size": 100, "gamma": 0.9, "learning_rate": 2e-3}
     learner = _learner(point(), {"algorithm": "PPO", "options": options}, environments=4, steps_per_round=6000)
-    before = learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"]
-    learner.improve(known(), store, np.random.default_rng(0))
-    after = learner.evaluate(known(), np.random.default_rng(9)).metrics["gold"]
+    before = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
+    learner.improve(Known(), store, np.random.default_rng(0))
+    after = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
     assert after > max(-5.0, before + 3.0)
 
 
-def test_the_replay_holds_the_newest_rewards_whole_and_never_the_gold(
-    point: Make, known: Any, store: Store[Segment]
-) -> None:
+def test_the_replay_holds_the_newest_rewards_whole_and_never_the_gold(store: Store[Segment]) -> None:
     learner = _learner(point(), SAC_)
-    for scale in (1.0, 5.0, 7.0):  # the third round wraps the ring of 150 steps
-        learner.improve(known(lambda o, a, s=scale: s * o[..., 0] + a[..., 0]), store, np.random.default_rng(0))
+    for number in range(3):  # the second round wraps the ring of 150 steps
+        learner.improve(Known(lambda o, a: o[..., 0] + a[..., 0]), store, np.random.default_rng(number))
     buffer = learner.model.replay_buffer
     assert buffer.full
-    relabel(buffer, known(lambda o, a: 3.0 * o[..., 0] + a[..., 0]))
+    relabel(buffer, Known(lambda o, a: 3.0 * o[..., 0] + a[..., 0]))
     np.testing.assert_allclose(buffer.rewards, 3.0 * buffer.observations[..., 0] + buffer.actions[..., 0], atol=1e-6)
 
 
-def test_relabelling_sees_actions_as_they_were_executed(known: Any) -> None:
-    space = gymnasium.spaces.Box(np.float32([-2.0]), np.float32([6.0]))
+def test_relabelling_sees_actions_as_they_were_executed() -> None:
+    space = gymnasium.spaces.Box(np.array([-2.0], np.float32), np.array([6.0], np.float32))
     buffer = ReplayBuffer(6, gymnasium.spaces.Box(-1.0, 1.0, (1,)), space, n_envs=2)
     step = np.zeros((2, 1), np.float32)
-    buffer.add(step, step, np.float32([[-1.0], [0.5]]), np.zeros(2), np.zeros(2), [{}, {}])
-    relabel(buffer, known(lambda o, a: a[..., 0]))
+    buffer.add(step, step, np.array([[-1.0], [0.5]], np.float32), np.zeros(2), np.zeros(2), [{}, {}])
+    relabel(buffer, Known(lambda o, a: a[..., 0]))
     assert buffer.rewards[:1].tolist() == [[-2.0, 4.0]]
     assert not buffer.rewards[1:].any()
 
 
-def test_a_buffer_that_keeps_more_than_transitions_is_refused(known: Any) -> None:
+def test_a_buffer_that_keeps_more_than_transitions_is_refused() -> None:
     class Other(ReplayBuffer):  # type: ignore[misc]
         pass
 
     box = gymnasium.spaces.Box(-1.0, 1.0, (1,))
     with pytest.raises(ValueError, match="plain ReplayBuffer, got Other"):
-        relabel(Other(4, box, box), known())
+        relabel(Other(4, box, box), Known())
 
 
 def test_the_wrapper_works_in_a_script_of_ones_own() -> None:
@@ -152,12 +143,12 @@ def test_the_wrapper_works_in_a_script_of_ones_own() -> None:
     assert not (model.rollout_buffer.rewards == 1.0).any()
 
 
-def test_the_wrapper_scores_the_observation_before_the_action(known: Any) -> None:
-    env = LearnedReward(make_vec_env("Pendulum-v1", 2, seed=0), known(lambda o, a: o[..., 2] + 100 * a[..., 0]))
+def test_the_wrapper_scores_the_observation_before_the_action() -> None:
+    env = LearnedReward(make_vec_env("Pendulum-v1", 2, seed=0), Known(lambda o, a: o[..., 2] + 100 * a[..., 0]))
     observations = env.reset()
-    actions = np.float32([[0.5], [9.0]])
+    actions = np.array([[0.5], [9.0]], np.float32)
     _, rewards, _, _ = env.step(actions)
-    np.testing.assert_allclose(rewards, observations[:, 2] + 100 * np.float32([0.5, 2.0]), rtol=1e-5)
+    np.testing.assert_allclose(rewards, observations[:, 2] + 100 * np.array([0.5, 2.0], np.float32), rtol=1e-5)
 
 
 def test_a_time_limit_is_told_from_a_termination_and_the_last_observation_kept() -> None:
@@ -175,20 +166,20 @@ def test_discrete_actions_are_seen_one_hot_from_any_start() -> None:
     assert executed(gymnasium.spaces.Discrete(3, start=5), np.array([5, 7])).tolist() == [[1, 0, 0], [0, 0, 1]]
 
 
-def test_steps_that_the_algorithm_would_overshoot_are_refused(point: Make) -> None:
+def test_steps_that_the_algorithm_would_overshoot_are_refused() -> None:
     with pytest.raises(ConfigError, match="must be a multiple of 40"):
         _learner(point(), PPO, steps_per_round=100)
 
 
-def test_an_option_that_the_algorithm_does_not_have_is_refused_by_name(point: Make) -> None:
+def test_an_option_that_the_algorithm_does_not_have_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="learning_rat"):
         _learner(point(), {"algorithm": "PPO", "options": {"learning_rat": 1.0}})
 
 
-def test_sac_needs_continuous_actions(point: Make) -> None:
+def test_sac_needs_continuous_actions() -> None:
     with pytest.raises(ConfigError, match="use PPO"):
         _learner(point(discrete=True), SAC_)
 
 
-def test_the_algorithm_is_stable_baselines3s_own(point: Make) -> None:
+def test_the_algorithm_is_stable_baselines3s_own() -> None:
     assert isinstance(_learner(point(), SAC_).model, SAC)

@@ -57,13 +57,22 @@ def word(task: Reviews, text: str = " the") -> int:
 VARIANTS: list[dict[str, object]] = [
     {},
     {"beta": 0.0},
-    {"advantage": "group_normalised", "reduction": "sequence", "clip": 0.2, "epochs": 2, "minibatches": 2, "kl_in": "loss"},
+    {
+        "advantage": "group_normalised",
+        "reduction": "sequence",
+        "clip": 0.2,
+        "epochs": 2,
+        "minibatches": 2,
+        "kl_in": "loss",
+    },
     {"advantage": "batch_mean", "reduction": "token", "temperature": 0.8, "kl_target": 3.0},
 ]
 
 
 @pytest.mark.parametrize("changes", VARIANTS)
-def test_every_variant_learns_to_say_the_rewarded_word_more_often(toy_reviews: Reviews, changes: dict[str, object]) -> None:
+def test_every_variant_learns_to_say_the_rewarded_word_more_often(
+    toy_reviews: Reviews, changes: dict[str, object]
+) -> None:
     likes = reward(word(toy_reviews))
     one = learner(toy_reviews, updates=12, prompts=8, learning_rate=5e-3, **changes)
     before = one.evaluate(likes, np.random.default_rng(0)).metrics["learned"]
@@ -293,5 +302,3 @@ def test_the_formula_says_what_the_settings_say() -> None:
     other = TextSettings(clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised")
     assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 (log pi(y_t) - log ref(y_t))^2 / 2" in other.formula()
     assert "ref" not in text_formula(TextSettings(beta=0.0))
-
-

@@ -37,7 +37,7 @@ def test_a_score_does_not_hang_on_the_batch_or_its_padding(toy_reviews: Reviews,
     together = reward.member_scores(candidates)
     alone = np.concatenate([reward.member_scores([c]) for c in candidates], 1)
     turned = reward.member_scores(candidates[::-1])[:, ::-1]
-    padded = {k: x for k, x in reward.stack(candidates).items()}
+    padded = dict(reward.stack(candidates))
     if train == "full":
         padded["tokens"] = torch.cat([padded["tokens"], torch.full((20, 7), 9)], 1)
     np.testing.assert_allclose(together, alone, atol=1e-5)
@@ -82,7 +82,9 @@ def test_heads_start_small_and_apart(toy_reviews: Reviews) -> None:
 
 
 @BOTH
-def test_settling_gives_each_member_mean_zero_and_unit_spread_on_what_it_saw(toy_reviews: Reviews, train: Train) -> None:
+def test_settling_gives_each_member_mean_zero_and_unit_spread_on_what_it_saw(
+    toy_reviews: Reviews, train: Train
+) -> None:
     reward, candidates = make(toy_reviews, train), some(toy_reviews, 30)
     assert not reward.fitted
     raw = reward.scores(reward.stack(candidates)).detach().numpy()
@@ -160,5 +162,3 @@ def test_a_control_task_is_refused() -> None:
 
 def test_nothing_is_left_in_training_mode(toy_reviews: Reviews) -> None:
     assert not any(m.training for m in make(toy_reviews)._backbone.modules())
-
-

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
 import torch
 
 from prefrl.envs.control import GymnasiumTask
@@ -61,7 +60,8 @@ class Known:
     fitted: bool = True
 
     def rewards(self, observations: Floats, actions: Floats) -> Floats:
-        return self.function(observations, actions).astype(np.float32)
+        rewards: Floats = self.function(observations, actions).astype(np.float32)
+        return rewards
 
     def stack(self, candidates: Sequence[Segment]) -> Mapping[str, torch.Tensor]:
         raise NotImplementedError
@@ -78,7 +78,8 @@ class Known:
         return np.stack([[self.rewards(c.observations, c.actions).sum() for c in candidates]])
 
     def score(self, candidates: Sequence[Segment]) -> Floats:
-        return self.member_scores(candidates)[0]
+        scores: Floats = self.member_scores(candidates)[0]
+        return scores
 
     def state(self) -> State:
         return {}
@@ -86,30 +87,17 @@ class Known:
     def load(self, state: State) -> None: ...
 
 
-@pytest.fixture
-def known() -> type[Known]:
-    return Known
-
-
-@pytest.fixture
-def point() -> Callable[..., GymnasiumTask]:
-    """point(discrete=False, spent=[], hide_gold=False) -> task; `spent` grows by the environments of each step."""
-
-    def make(discrete: bool = False, spent: list[int] | None = None, hide_gold: bool = False) -> GymnasiumTask:
-        box = (np.float32([-1.0]), np.float32([1.0]))
-        task = GymnasiumTask(
-            name="Point",
-            horizon=20,
-            segment_steps=5,
-            observation_size=1,
-            action_size=2 if discrete else 1,
-            action_bounds=None if discrete else box,
-            fps=5.0,
-            frame_size=64,
-            make=lambda n: Vectorised(Point(), n, 20),
-        )
-        made = task.make
-        kept: list[int] = [] if spent is None else spent
-        return replace(task, make=lambda n: Watched(made(n), n, kept, hide_gold))
-
-    return make
+def point(discrete: bool = False, spent: list[int] | None = None, hide_gold: bool = False) -> GymnasiumTask:
+    """The task; `spent` grows by the number of environments with each step."""
+    kept: list[int] = [] if spent is None else spent
+    return GymnasiumTask(
+        name="Point",
+        horizon=20,
+        segment_steps=5,
+        observation_size=1,
+        action_size=2 if discrete else 1,
+        action_bounds=None if discrete else (np.array([-1.0], np.float32), np.array([1.0], np.float32)),
+        fps=5.0,
+        frame_size=64,
+        make=lambda n: Watched(Vectorised(Point(), n, 20), n, kept, hide_gold),
+    )

@@ -1,0 +1,228 @@
+"""One RLOO update of a 1M-parameter Llama: prefrl's text learner against TRL's RLOOTrainer, at equal work.
+
+    python benchmarks/text_loop.py [--short] [--peers .venv-peers/bin/python]
+
+Both start from the same weights and prompts: 16 prompts x 4 responses of 48 tokens, KL to a reference at 0.05, one
+Adam step, float32, no dropout, no gradient checkpointing, one thread each. The two processes take turns, an update
+each; CPU seconds of an update are compared by their medians. `ratio` is peer / ours: above 1, prefrl needs fewer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+PROMPTS, SAMPLES, NEW_TOKENS, VOCABULARY, PROMPT_TOKENS = 16, 4, 48, 2048, 8
+BETA, LEARNING_RATE = 0.05, 1e-4
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--short", action="store_true", help="fewer repetitions: under two minutes")
+    parser.add_argument("--peers", default=".venv-peers/bin/python", help="Python of the environment that holds TRL")
+    parser.add_argument("--worker", choices=["ours", "peer"], help=argparse.SUPPRESS)
+    parser.add_argument("--folder", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.worker:
+        {"ours": ours, "peer": peer}[options.worker](Path(options.folder))
+        return
+    if not Path(options.peers).exists():
+        sys.exit(f"no {options.peers}: make an environment, pip install -r benchmarks/peers-text.txt, and say --peers")
+    with tempfile.TemporaryDirectory() as folder:
+        make_model(Path(folder))
+        print(json.dumps(compare(Path(folder), options.peers, 5 if options.short else 20) | {"short": options.short}))
+
+
+def make_model(folder: Path) -> None:
+    """Random weights and a tokenizer of whole words, t0 ... t2047, for both sides to read."""
+    import torch
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    torch.manual_seed(0)
+    config = LlamaConfig(
+        vocab_size=VOCABULARY,
+        hidden_size=128,
+        intermediate_size=344,
+        num_hidden_layers=4,
+        num_attention_heads=4,
+        max_position_embeddings=256,
+        tie_word_embeddings=True,
+        pad_token_id=0,
+        bos_token_id=1,
+        eos_token_id=2,
+    )
+    LlamaForCausalLM(config).save_pretrained(folder)
+    words = Tokenizer(models.WordLevel({f"t{i}": i for i in range(VOCABULARY)}, unk_token="t3"))
+    words.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
+    words.save(str(folder / "words.json"))
+
+
+def prompts(round: int) -> list[str]:
+    """The same 16 prompts for both sides."""
+    return [
+        " ".join(f"t{10 + (997 * round + 31 * i + 7 * j) % (VOCABULARY - 10)}" for j in range(PROMPT_TOKENS))
+        for i in range(PROMPTS)
+    ]
+
+
+def reward_of(tokens: list[int]) -> float:
+    """A reward that costs nothing: the share of even tokens."""
+    return sum(token % 2 == 0 for token in tokens) / len(tokens)
+
+
+def compare(folder: Path, peers: str, repetitions: int) -> dict[str, Any]:
+    """Let both sides make an update in turn; the first two are for warming up."""
+    workers = {"ours": start("ours", sys.executable, folder), "peer": start("peer", peers, folder)}
+    seconds: dict[str, list[float]] = {"ours": [], "peer": []}
+    for i in range(repetitions + 2):
+        for name in ("ours", "peer") if i % 2 else ("peer", "ours"):
+            found = ask(workers[name])
+            if found["tokens"] != PROMPTS * SAMPLES * NEW_TOKENS:
+                raise RuntimeError(f"{name} generated {found['tokens']} tokens: the work is not equal")
+            seconds[name] += [found["seconds"]] if i >= 2 else []
+    for worker in workers.values():
+        worker.kill()
+    medians = {name: statistics.median(values) for name, values in seconds.items()}
+    spread = {name: [round(min(values), 4), round(max(values), 4)] for name, values in seconds.items()}
+    return {
+        "name": "text_loop: one RLOO update, 1M parameters, 64 x 48 tokens, fp32",
+        "unit": "CPU s",
+        "ours": round(medians["ours"], 4),
+        "peer": round(medians["peer"], 4),
+        "ratio": round(medians["peer"] / medians["ours"], 3),
+        "spread": spread,
+        "equal_work": True,
+        "repetitions": repetitions,
+    }
+
+
+def start(name: str, python: str, folder: Path) -> subprocess.Popen[str]:
+    command = [python, __file__, "--worker", name, "--folder", str(folder)]
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ONE_THREAD}
+    )
+
+
+def ask(worker: subprocess.Popen[str]) -> dict[str, Any]:
+    """Have one update made; other lines that a library prints are passed over."""
+    assert worker.stdin is not None
+    assert worker.stdout is not None
+    worker.stdin.write("go\n")
+    worker.stdin.flush()
+    for line in worker.stdout:
+        if line.startswith("RESULT "):
+            found: dict[str, Any] = json.loads(line[7:])
+            return found
+    raise RuntimeError(f"{worker.args!r} ended early")
+
+
+def wait() -> float:
+    """Wait for our turn; the time at which it begins."""
+    if not sys.stdin.readline():
+        sys.exit()
+    return time.process_time()
+
+
+def tell(begin: float, tokens: int) -> None:
+    print("RESULT " + json.dumps({"seconds": time.process_time() - begin, "tokens": tokens}), flush=True)
+
+
+def ours(folder: Path) -> None:
+    import numpy as np
+    import torch
+    from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
+
+    from prefrl.improve.text import TextSettings
+
+    torch.set_num_threads(1)
+    words = PreTrainedTokenizerFast(tokenizer_file=str(folder / "words.json"))
+    tokenizer = SimpleNamespace(encode=words.encode, decode=words.decode, eos_token_id=-1)  # no end: a fixed length
+    rounds = iter(range(10**6))
+    task: Any = SimpleNamespace(
+        kind="text",
+        tokenizer=tokenizer,
+        response_tokens=NEW_TOKENS,
+        model=lambda: LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32).eval(),
+        prompts=lambda count, rng: prompts(next(rounds)),
+    )
+    reward: Any = SimpleNamespace(score=lambda found: np.array([reward_of(list(r.tokens)) for r in found], np.float32))
+    settings = TextSettings(
+        updates=1, prompts=PROMPTS, responses=SAMPLES, beta=BETA, learning_rate=LEARNING_RATE, missing_end_penalty=0.0
+    )
+    store: Any = None
+    learner, rng = settings.build(task, np.random.default_rng(0)), np.random.default_rng(1)
+    while True:
+        before, begin = learner.steps.learn, wait()
+        learner.improve(reward, store, rng)
+        tell(begin, learner.steps.learn - before)
+
+
+def peer(folder: Path) -> None:
+    import torch
+    from datasets import Dataset
+    from transformers import PreTrainedTokenizerFast, TrainerCallback
+    from trl import RLOOConfig, RLOOTrainer
+
+    torch.set_num_threads(1)
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_file=str(folder / "words.json"), pad_token="t0", bos_token="t1", eos_token="t2", padding_side="left"
+    )
+    counts: list[int] = []
+
+    def score(completion_ids: list[list[int]], **_: Any) -> list[float]:
+        counts.append(sum(map(len, completion_ids)))
+        return [reward_of(tokens) for tokens in completion_ids]
+
+    class Turns(TrainerCallback):
+        begin = 0.0
+
+        def on_train_begin(self, *_: Any, **__: Any) -> None:
+            self.begin = wait()
+
+        def on_step_end(self, *_: Any, **__: Any) -> None:
+            tell(self.begin, counts[-1])
+            self.begin = wait()
+
+    config = RLOOConfig(
+        output_dir=str(folder / "peer"),
+        per_device_train_batch_size=PROMPTS * SAMPLES,
+        num_generations=SAMPLES,
+        max_completion_length=NEW_TOKENS,
+        generation_kwargs={"min_new_tokens": NEW_TOKENS},
+        steps_per_generation=1,
+        num_iterations=1,
+        beta=BETA,
+        learning_rate=LEARNING_RATE,
+        lr_scheduler_type="constant",
+        max_grad_norm=1.0,
+        temperature=1.0,
+        top_p=1.0,
+        top_k=0,
+        max_steps=10**6,
+        bf16=False,
+        use_cpu=True,
+        gradient_checkpointing=False,
+        disable_dropout=True,
+        save_strategy="no",
+        logging_strategy="no",
+        report_to="none",
+        disable_tqdm=True,
+        model_init_kwargs={"dtype": torch.float32},
+    )
+    data = Dataset.from_dict({"prompt": [p for i in range(50) for p in prompts(i)]})
+    RLOOTrainer(str(folder), score, config, data, processing_class=tokenizer, callbacks=[Turns()]).train()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Segments as pictures, drawn again from their simulator states: nothing is rendered while a policy acts."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from prefrl.envs.fast.wrapped import make
+from prefrl.types import Floats, Segment
+
+INSTALL = "apt-get install -y libegl1 libgl1-mesa-dri"
+INK, RED, BLUE = (np.array(c, np.float32) for c in ((60, 66, 74), (201, 79, 69), (72, 120, 176)))
+
+
+def frames(name: str, segment: Segment, size: int) -> np.ndarray:
+    """(T, size, size, 3) uint8 pictures of a segment of the environment `name`.
+
+    Raises ValueError where the segment keeps no states, and RuntimeError where there is no OpenGL for MuJoCo.
+    """
+    if segment.states is None:
+        raise ValueError(
+            f"{name} cannot be drawn: its simulator gives no states to draw from; Pendulum, CartPole and MuJoCo "
+            "environments can be"
+        )
+    draw = {"Pendulum": _pendulum, "CartPole": _cartpole}.get(name.split("-")[0])
+    if draw is None:
+        return _mujoco(name, segment.states, size)
+    pictures = [draw(state, action, size) for state, action in zip(segment.states, segment.actions, strict=True)]
+    return np.rint(pictures).astype(np.uint8)
+
+
+# --- Classic control: lines with smooth edges, from each pixel's distance to them -----------------------------------
+
+
+def _pendulum(state: Floats, action: Floats, size: int) -> Floats:
+    """A rod that hangs at angle pi and stands at 0; the bar below shows the torque, from its middle."""
+    angle, torque = state[0], np.clip(action[0] / 2.0, -1.0, 1.0)
+    picture = np.full((size, size, 3), 255.0, np.float32)
+    _stroke(picture, (0.0, 0.0), (-np.sin(angle), np.cos(angle)), 0.09, RED)
+    _stroke(picture, (0.0, 0.0), (0.0, 0.0), 0.04, INK)
+    _stroke(picture, (0.0, -1.3), (-torque, -1.3), 0.03, BLUE)
+    return picture
+
+
+def _cartpole(state: Floats, action: Floats, size: int) -> Floats:
+    """A cart on a track of 4.8 metres. Off it, the cart stays at the picture's edge."""
+    x, angle = float(np.clip(state[0] / 2.4, -1.25, 1.25)), state[2]
+    picture = np.full((size, size, 3), 255.0, np.float32)
+    _stroke(picture, (-1.0, -0.42), (1.0, -0.42), 0.012, INK)
+    _stroke(picture, (x - 0.12, -0.3), (x + 0.12, -0.3), 0.09, BLUE)
+    _stroke(picture, (x, -0.3), (x + 0.8 * np.sin(angle), -0.3 + 0.8 * np.cos(angle)), 0.045, RED)
+    return picture
+
+
+def _stroke(picture: Floats, begin: tuple[float, float], end: tuple[float, float], radius: float, ink: Floats) -> None:
+    """Draw a line with round ends on a picture that shows [-1.5, 1.5] in both directions, y upwards."""
+    size = len(picture)
+    pixel = 3.0 / size
+    rows, columns = (_span(begin[k] * sign, end[k] * sign, radius + pixel, size) for k, sign in ((1, -1.0), (0, 1.0)))
+    across = (np.arange(size, dtype=np.float32) + 0.5) * pixel - 1.5
+    dx, dy = across[None, columns] - begin[0], -across[rows, None] - begin[1]
+    along = end[0] - begin[0], end[1] - begin[1]
+    share = np.clip((dx * along[0] + dy * along[1]) / max(along[0] ** 2 + along[1] ** 2, 1e-12), 0.0, 1.0)
+    distance = np.hypot(dx - share * along[0], dy - share * along[1])
+    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]
+    picture[rows, columns] += cover * (ink - picture[rows, columns])
+
+
+def _span(a: float, b: float, margin: float, size: int) -> slice:
+    """The pixels between two coordinates, and `margin` beyond."""
+    low, high = ((x + 1.5) / 3.0 * size for x in (min(a, b) - margin, max(a, b) + margin))
+    return slice(max(0, int(low)), max(0, min(size, int(high) + 1)))
+
+
+# --- MuJoCo -------------------------------------------------------------------------------------------------------
+# Not mujoco.Renderer: which OpenGL that uses hangs on an environment variable read when it is first imported.
+
+
+def _mujoco(name: str, states: Floats, size: int) -> np.ndarray:
+    import mujoco
+
+    with _context(size):
+        env = _model(name, size)
+        scene, option, data = mujoco.MjvScene(env.model, 1000), mujoco.MjvOption(), mujoco.MjData(env.model)
+        camera, view = _camera(env), mujoco.MjrRect(0, 0, size, size)
+        graphics_ = mujoco.MjrContext(env.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, graphics_)
+        # Without a GPU, shadows and reflections cost more than all the rest.
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        pictures = np.empty((len(states), size, size, 3), np.uint8)
+        for picture, state in zip(pictures, states, strict=True):
+            mujoco.mj_setState(env.model, data, state, mujoco.mjtState.mjSTATE_PHYSICS)
+            mujoco.mj_forward(env.model, data)
+            mujoco.mjv_updateScene(env.model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
+            mujoco.mjr_render(view, scene, graphics_)
+            mujoco.mjr_readPixels(picture, None, view, graphics_)
+        graphics_.free()
+    return pictures[:, ::-1]  # OpenGL's first row is the lowest
+
+
+def _model(name: str, size: int) -> Any:
+    """The gymnasium environment, its model set up for fast drawing; before the OpenGL context's buffers are made."""
+    env: Any = make(name, disable_env_checker=True).unwrapped
+    visual = env.model.vis
+    visual.quality.offsamples = visual.quality.shadowsize = 0
+    visual.global_.offwidth, visual.global_.offheight = size, size
+    return env
+
+
+def _camera(env: Any) -> Any:
+    """The environment's usual camera, which follows the body."""
+    import mujoco
+
+    camera = mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FREE, -1
+    camera.lookat[:] = env.model.stat.center
+    camera.distance = env.model.stat.extent
+    named = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    if named >= 0:
+        camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, named
+    return camera
+
+
+@contextmanager
+def _context(size: int) -> Iterator[None]:
+    """An OpenGL context without a screen. Raises RuntimeError where there is none."""
+    found = graphics()
+    if found is None:
+        raise RuntimeError(f"drawing MuJoCo needs OpenGL: run `{INSTALL}`")
+    try:
+        context = import_module(f"mujoco.{found}").GLContext(size, size)
+        context.make_current()
+    except Exception as error:  # PyOpenGL raises many kinds of its own
+        raise RuntimeError(f"OpenGL by {found} does not start ({error}); run `{INSTALL}`") from error
+    try:
+        yield
+    finally:
+        context.free()
+
+
+@cache
+def graphics() -> str | None:
+    """Which OpenGL there is: "egl" or "osmesa" on Linux, "cgl" or "glfw" elsewhere; None where there is none."""
+    if sys.platform != "linux":
+        return "cgl" if sys.platform == "darwin" else "glfw"
+    libraries = {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
+    return next((name for name, files in libraries.items() if any(map(_loads, files))), None)
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

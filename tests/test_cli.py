@@ -1,0 +1,177 @@
+"""What a person meets at the command line: the commands as a shell runs them, and what they say."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from prefrl.cli import main
+from prefrl.components import TABLE, kinds
+
+
+@pytest.fixture
+def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> "Shell":
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    return Shell(monkeypatch, capsys)
+
+
+class Shell:
+    """Runs `prefrl ...` in this process, and keeps what was printed."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys = monkeypatch, capsys
+        self.out = self.err = ""
+
+    def __call__(self, line: str) -> int:
+        self._monkeypatch.setattr(sys, "argv", ["prefrl", *line.split()])
+        try:
+            main()
+            code = 0
+        except SystemExit as error:
+            code = int(error.code or 0)
+        self.out, self.err = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in self._capsys.readouterr())
+        return code
+
+
+def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
+    assert prefrl("label control/toy loop.labels=30 --out labels") == 0
+    assert "30 of 30 queries answered" in prefrl.out
+    assert prefrl("fit labels --out reward fitting.epochs=20") == 0
+    assert "accuracy" in prefrl.out
+    assert prefrl("improve control/toy --reward reward --out policy") == 0
+    assert prefrl("evaluate policy") == 0
+    assert "gold" in prefrl.out
+    summary = json.loads(Path("policy/summary.json").read_text())
+    assert summary["labels"] == {"asked": 0, "answered": 0, "skipped": 0}
+    assert summary["steps"]["learn"] > 0
+    assert prefrl("label policy --out more loop.labels=5") == 0  # ask about the improved policy
+    assert "5 of 5" in prefrl.out
+
+
+def test_the_three_uses_stand_alone_for_text(prefrl: Shell) -> None:
+    assert prefrl("label text/toy loop.labels=12 --out labels") == 0
+    assert prefrl("export labels --to preferences.jsonl") == 0
+    rows = [json.loads(line) for line in Path("preferences.jsonl").read_text().splitlines()]
+    assert all(set(row) == {"prompt", "chosen", "rejected"} for row in rows)
+    assert prefrl("fit preferences.jsonl --config text/toy --out reward") == 0
+    assert prefrl("improve text/toy --reward reward --out policy loop.rounds=1") == 0
+    assert prefrl("evaluate policy") == 0
+    assert "fluency" in prefrl.out
+
+
+def test_candidates_of_ones_own_can_be_labelled(prefrl: Shell) -> None:
+    rows = [{"prompt": "this film was", "responses": [" wonderful .", " terrible .", " long ."]}]
+    Path("given.jsonl").write_text("\n".join(json.dumps(row) for row in rows))
+    assert prefrl("label text/toy --given given.jsonl --out labels") == 0
+    assert prefrl("export labels --to out.jsonl") == 0
+    best = {json.loads(line)["chosen"] for line in Path("out.jsonl").read_text().splitlines()}
+    assert " wonderful ." in best
+    assert " terrible ." not in best
+    Path("given.jsonl").write_text('{"prompt": "p"}')
+    assert prefrl("label text/toy --given given.jsonl --out other") == 2
+    assert "row 1: expected a prompt and its responses" in prefrl.err
+
+
+def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
+    assert prefrl("label control/toy loop.labels=6 --out labels") == 0
+    assert prefrl("export labels --to bundle --form bundle") == 0
+    assert prefrl("import bundle --out copy") == 0
+    assert "6 judgements" in prefrl.out
+    assert prefrl("fit copy --config control/toy --out reward") == 0
+    assert prefrl("export labels --to out.jsonl") == 2
+    assert "--form bundle" in prefrl.err
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("run control/toy --out run learner.epoch=3", "learner.epoch: unknown setting; did you mean 'epochs'?"),
+        ("run control/tay --out run", "no such preset or file; did you mean 'control/toy'?"),
+        ("run control/toy --out run task.segment_steps=101", "101"),
+        ("run control/toy --out run task.env=Pendulam-v1", "Pendulum-v1"),
+        ("evaluate .", "holds neither a run"),
+        ("fit . --out reward", "--config"),
+        ("describe pppo", "did you mean 'ppo'?"),
+    ],
+)
+def test_a_mistake_gets_a_line_on_stderr_and_status_two(prefrl: Shell, line: str, message: str) -> None:
+    assert prefrl(line) == 2
+    assert message in prefrl.err.replace("\n", " ")
+    assert "Traceback" not in prefrl.err
+    assert prefrl.out == ""
+
+
+def test_a_run_without_a_folder_says_what_is_missing(prefrl: Shell) -> None:
+    assert prefrl("run control/toy") == 2
+    assert "--out DIR" in prefrl.err
+
+
+def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -> None:
+    assert prefrl("run control/toy --dry-run") == 0
+    assert re.search(r"about [\d.]+ s", prefrl.out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_run_into_the_folder_of_another_is_refused(prefrl: Shell) -> None:
+    assert prefrl("run control/toy --out run") == 0
+    assert "report: run/report.html" in prefrl.out
+    assert prefrl("run control/toy --out run seed=1") == 2
+    assert "seed is 0 there, 1 here" in prefrl.err
+    assert prefrl("resume run") == 0
+
+
+@pytest.mark.parametrize("name", [kind for role in TABLE for kind in kinds(role)])
+def test_every_kind_is_described_with_every_setting_explained(prefrl: Shell, name: str) -> None:
+    assert prefrl(f"describe {name}") == 0
+    assert "meaning" in prefrl.out
+    for row in re.findall(r"^│ (\w+) +│[^│]*│[^│]*│ *│$", prefrl.out, re.MULTILINE):
+        assert row == "kind", f"{name}.{row} has no docstring"
+
+
+def test_learners_print_what_they_optimise(prefrl: Shell) -> None:
+    for kind in ("ppo", "text"):
+        assert prefrl(f"describe {kind}") == 0
+        assert "what it optimises" in prefrl.out
+        assert "maximise" in prefrl.out.lower()
+
+
+@pytest.mark.parametrize("line", ["presets", "describe", "describe control/toy", "describe loop", "doctor"])
+def test_commands_that_only_tell_work(prefrl: Shell, line: str) -> None:
+    assert prefrl(line) == 0
+    assert len(prefrl.out) > 100
+
+
+def test_help_loads_nothing_heavy() -> None:
+    heavy = {"torch", "transformers", "gymnasium", "pydantic", "sqlalchemy"}
+    code = f"import sys, prefrl.cli; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_control_user_never_loads_transformers(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.argv = ['prefrl', 'run', 'control/toy', '--out', 'run']\n"
+        "from prefrl.cli import main\ntry: main()\nexcept SystemExit: print('transformers' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "prefrl", "run", "control/toy", "--out", "run", "loop.rounds=200"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as child:
+        assert child.stdout is not None
+        for _ in range(2):
+            child.stdout.readline()
+        time.sleep(0.2)
+        child.send_signal(signal.SIGINT)
+        rest, errors = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert "prefrl resume run" in rest.replace("\n", " ")
+    assert "Traceback" not in errors

@@ -1,0 +1,60 @@
+"""Every command and code block of the documents runs, in an empty folder where the demo's runs lie, at toy size."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUN_BY_CI = {"make demo", "make test", "source .venv/bin/activate"}
+"""CI runs these by themselves, before or around the tests."""
+
+
+def blocks(path: Path) -> list[tuple[str, str]]:
+    """(language, code) of each block that can be run."""
+    return re.findall(r"^```(python|bash)\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="session")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("workshop")
+    for preset, name in (("control/toy", "pendulum"), ("text/toy", "reviews")):
+        run(f"prefrl run {preset} --out runs/{name}", folder)
+    return folder
+
+
+def run(code: str, folder: Path) -> None:
+    """Run shell commands there, with somebody at the keyboard who always presses 1."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", code],
+        cwd=folder,
+        env=os.environ | {"PATH": path, "OMP_NUM_THREADS": "1"},
+        input="1\n" * 100,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"{code}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_block_runs(path: Path, workshop: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workshop)
+    for language, code in blocks(path):
+        if language == "python":
+            exec(compile(code, str(path), "exec"), {"__name__": "__main__"})
+        else:
+            lines = [line for line in code.splitlines() if line.split("#")[0].strip() not in RUN_BY_CI]
+            run("\n".join(lines), workshop)
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for path in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
+            assert (path.parent / target).exists(), f"{path.name} links to {target}"
