@@ -180,11 +180,19 @@ def presets() -> None:
 
 
 @app.command()
-def describe(kind: Annotated[str | None, typer.Argument(help="A component's kind, or a preset.")] = None) -> None:
+def describe(
+    kind: Annotated[str | None, typer.Argument(help="A component's kind, or a preset.")] = None,
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of config files instead.")] = False,
+) -> None:
     """Explain a component's settings, or a preset; without a name, list the kinds."""
     from prefrl.console import console
     from prefrl.explain import explain
 
+    if schema:
+        from prefrl.schema import text
+
+        print(text(), end="")
+        return
     for part in explain(kind):
         console.print(part)
 

@@ -1,0 +1,58 @@
+"""The JSON Schema of a config file, for editors that complete and check YAML. Shipped as configs/schema.json."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from prefrl.components import TABLE, Role, settings_class
+from prefrl.config import Config
+
+ROLES: dict[str, Role] = {
+    "task": "tasks",
+    "labeler": "labelers",
+    "select": "selectors",
+    "reward": "rewards",
+    "learner": "learners",
+}
+REQUIRED = ["task", "reward", "learner"]
+
+
+def schema() -> dict[str, Any]:
+    """Every key of a config with its type and meaning; for a component, the settings of each built-in kind."""
+    definitions: dict[str, Any] = {}
+    properties = {name: _group(name, field.annotation, definitions) for name, field in Config.model_fields.items()}
+    for name, field in Config.model_fields.items():
+        properties[name]["description"] = field.description
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "prefrl config",
+        "type": "object",
+        "properties": properties,
+        "required": REQUIRED,
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+
+
+def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    """The schema of one top-level key."""
+    if name in ROLES:
+        role = ROLES[name]
+        return {"oneOf": [_define(settings_class(role, kind), definitions, kind) for kind in TABLE[role]]}
+    return _define(annotation, definitions, None) if hasattr(annotation, "model_json_schema") else {"type": "integer"}
+
+
+def _define(cls: Any, definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
+    """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
+    made = cls.model_json_schema(ref_template="#/$defs/{model}")
+    definitions |= made.pop("$defs", {})
+    if kind is not None:
+        made["required"] = sorted({"kind", *made.get("required", [])})
+    definitions[cls.__name__] = made
+    return {"$ref": f"#/$defs/{cls.__name__}"}
+
+
+def text() -> str:
+    """The schema as it is shipped."""
+    return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"
