@@ -42,13 +42,17 @@ class CloningSettings(Settings):
     """The starting policy: its size, and how it learns to write like the grammar."""
 
     layers: int = Field(4, ge=1)
+    """Of the Llama-like network."""
     width: int = Field(128, ge=8)
+    """Of its hidden states."""
     heads: int = Field(4, ge=1)
+    """Of its attention."""
     vocabulary: int = Field(2048, ge=300)
     """The most tokens of the byte-level BPE; 256 of them are the bytes."""
-    reviews: int = Field(32_000, ge=64)
+    reviews: int = Field(40_000, ge=64)
     """How many texts the grammar writes; each is seen once."""
     batch_size: int = Field(16, ge=1)
+    """Texts in a gradient step."""
     learning_rate: float = Field(3e-3, gt=0)
     """AdamW's peak; it warms up over the first twentieth and falls to 0 along a cosine."""
     seed: int = Field(0, ge=0)
@@ -123,7 +127,7 @@ def clone(settings: CloningSettings, grammar: Grammar) -> tuple[LlamaForCausalLM
         model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True
     )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, len(batches)))
-    with _progress(len(batches)) as report:
+    with progress(len(batches), Console(stderr=True)) as report:
         for batch in batches:
             report.advance(_step(model, optimizer, batch))
             schedule.step()
@@ -213,16 +217,16 @@ class _Line:
 class _Bar:
     def __init__(self, progress: Progress, steps: int) -> None:
         self._progress = progress
-        self._task = progress.add_task("cloning the grammar", total=steps, loss=float("nan"))
+        self._task = progress.add_task("cloning the grammar", total=steps, note="")
 
     def advance(self, loss: float) -> None:
-        self._progress.update(self._task, advance=1, loss=loss)
+        speed = self._progress.tasks[self._task].speed or 0.0
+        self._progress.update(self._task, advance=1, note=f"{speed:.1f} steps/s, loss {loss:.2f}")
 
 
 @contextmanager
-def _progress(steps: int) -> Iterator[_Report]:
+def progress(steps: int, console: Console) -> Iterator[_Report]:
     """A bar on a terminal, one line elsewhere."""
-    console = Console(stderr=True)
     if not console.is_terminal:
         console.print(f"cloning the grammar into a starting policy, {steps} steps (once; it is kept)", soft_wrap=True)
         yield _Line()
@@ -231,9 +235,8 @@ def _progress(steps: int) -> Iterator[_Report]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.speed:.1f} steps/s"),
-        TextColumn("loss {task.fields[loss]:.2f}"),
+        TextColumn("{task.fields[note]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console) as progress:
-        yield _Bar(progress, steps)
+    with Progress(*columns, console=console) as bar:
+        yield _Bar(bar, steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -68,7 +69,7 @@ def round_line(round: Round[Any]) -> Text:
     parts = [
         Text(f"round {round.number:>3}", style="bold"),
         Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue"),
-        Text(f"learned {m.get('evaluate/learned', float('nan')):>8.3g}", style="yellow"),
+        Text(f"learned {m['evaluate/learned']:>8.3g}" if "evaluate/learned" in m else " " * 16, style="yellow"),
     ]
     for key, label, form in (
         ("fit/accuracy_held_out", "accuracy", ".2f"),
@@ -77,8 +78,8 @@ def round_line(round: Round[Any]) -> Text:
         ("label/answered", "labels", ".0f"),
         ("steps/learn", "steps", ",.0f"),
     ):
-        if key in m:
-            parts.append(Text(f"{label} {m[key]:{form}}"))
+        if not math.isnan(m.get(key, math.nan)):
+            parts.append(Text(f"{label} {m[key] + 0.0:{form}}"))
     seconds = sum(v for k, v in m.items() if k.startswith("seconds/"))
     return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
 

@@ -129,6 +129,8 @@ class Loop(Generic[C]):
             "steps": {name: float(n) for name, n in self.learner.steps._asdict().items()},
             "seconds": self._seconds,
         }
+        if not self.reward.fitted:
+            stages["evaluate"].pop("learned", None)  # what an unfitted network says means nothing
         self.round, self._seconds, self.stage = number, {}, "idle"
         metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
         return Round(number, metrics, evaluated.examples, fitted)

@@ -31,6 +31,7 @@ class MLPSettings(Settings):
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""
     activation: Literal["tanh", "relu", "silu"] = "tanh"
+    """Between the layers."""
     gain: float = Field(10.0, gt=0)
     """A segment's raw score is this times the mean of its networks' outputs, when it has the task's usual length."""
 

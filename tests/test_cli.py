@@ -93,8 +93,8 @@ def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
     [
         ("run control/toy --out run learner.epoch=3", "learner.epoch: unknown setting; did you mean 'epochs'?"),
         ("run control/tay --out run", "no such preset or file; did you mean 'control/toy'?"),
-        ("run control/toy --out run task.segment_steps=101", "101"),
-        ("run control/toy --out run task.env=Pendulam-v1", "Pendulum-v1"),
+        ("run control/toy --out run task.segment_steps=41", "a segment of 41 steps is longer than an episode of 40"),
+        ("run control/pendulum --out run task.env=Pendulam-v1", "Pendulum-v1"),
         ("evaluate .", "holds neither a run"),
         ("fit . --out reward", "--config"),
         ("describe pppo", "did you mean 'ppo'?"),

@@ -40,9 +40,9 @@ def numbers(folder: Path) -> list[dict[str, float]]:
 
 @pytest.mark.parametrize("name", TOYS)
 def test_a_run_leaves_the_files_that_the_design_names(name: str, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with Run(Config.load(name), folder) as run:
-        assert [r.number for r in run] == [0, 1, 2]
+    folder, config = tmp_path / "run", Config.load(name)
+    with Run(config, folder) as run:
+        assert [r.number for r in run] == list(range(config.loop.rounds + 1))
         run.report()
     found = {p.name for p in folder.iterdir()}
     assert found >= {"config.yaml", "metrics.jsonl", "summary.json", "store.db", "report.html", "checkpoints", "gold"}
@@ -63,7 +63,7 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(name: str, tmp_path
         next(rounds), next(rounds)
     with Run.resume(tmp_path / "parts") as run:
         assert run.notes == ["going on after round 1"]
-        assert [r.number for r in run] == [2]
+        assert [r.number for r in run] == list(range(2, run.config.loop.rounds + 1))
     assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
     assert numbers(tmp_path / "parts") == numbers(tmp_path / "whole")
 
@@ -95,11 +95,11 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(name: str, tmp_path: 
 def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
     finish("control/toy", tmp_path / "run")
     finish("control/toy", tmp_path / "whole")
-    broken = tmp_path / "run/checkpoints/round-0002/learner.safetensors"
+    broken = tmp_path / "run/checkpoints/round-0003/learner.safetensors"
     broken.write_bytes(broken.read_bytes()[:-1])
     with Run.resume(tmp_path / "run") as run:
         assert "learner.safetensors" in run.notes[0]
-        assert run.notes[1] == "going on after round 1"
+        assert run.notes[1] == "going on after round 2"
         list(run)
     assert weights(tmp_path / "run") == weights(tmp_path / "whole")
 
@@ -119,12 +119,12 @@ def test_a_finished_run_is_left_as_it_is(tmp_path: Path) -> None:
     before = weights(tmp_path / "run")
     finish("control/toy", tmp_path / "run")
     assert weights(tmp_path / "run") == before
-    assert len(numbers(tmp_path / "run")) == 3
+    assert len(numbers(tmp_path / "run")) == 4
 
 
 def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) -> None:
     finish("control/toy", tmp_path / "run")
-    with pytest.raises(RunError, match=r"fitting\.epochs is 5 there, 6 here"):
+    with pytest.raises(RunError, match=r"fitting\.epochs is 60 there, 6 here"):
         Run(Config.load("control/toy", ["fitting.epochs=6"]), tmp_path / "run")
     (tmp_path / "things").mkdir()
     (tmp_path / "things/letter.txt").write_text("dear")
@@ -136,7 +136,7 @@ def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) ->
 
 def test_a_checkpoint_holds_all_that_is_needed_to_use_it(tmp_path: Path) -> None:
     finish("control/toy", tmp_path / "run")
-    shutil.copytree(tmp_path / "run/checkpoints/round-0002", tmp_path / "alone")
+    shutil.copytree(tmp_path / "run/checkpoints/round-0003", tmp_path / "alone")
     saved = open_saved(tmp_path / "alone")
     assert saved.config == Config.load("control/toy")
     assert load_state(saved.folder, "learner")["steps"][0] > 0

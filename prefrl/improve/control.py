@@ -56,6 +56,7 @@ class PPOSettings(Settings):
     learning_rate: float = Field(1e-3, gt=0)
     """Adam's step size, or where it starts when it is steered."""
     discount: float = Field(0.99, ge=0, le=1)
+    """What a reward a step later counts for."""
     trace: float = Field(0.95, ge=0, le=1)
     """GAE's lambda: 1 weighs whole returns, 0 only the next step."""
     target_kl: float | None = Field(0.01, gt=0)
@@ -63,15 +64,19 @@ class PPOSettings(Settings):
     clip: float | None = Field(0.2, gt=0)
     """How far the ratio of new to old probability counts; null for the plain policy gradient."""
     value_weight: float = Field(0.5, ge=0)
+    """Weight of the critic's loss."""
     entropy: float = Field(0.01, ge=0)
     """Weight of the entropy bonus: it keeps a policy from settling on what an early, wrong reward praised."""
     critic_epochs: int = Field(10, ge=0)
     """Extra passes for the critic alone at the start of a round, when the reward is new to it."""
     max_grad_norm: float = Field(0.5, gt=0)
+    """A gradient that is longer is shortened to this."""
     hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers, of the policy and of the critic."""
     initial_std: float = Field(1.0, gt=0)
     """Of the actions' noise at the start, in units of half the action bounds."""
     evaluation_episodes: int = Field(20, ge=1)
+    """Episodes of an evaluation, with the policy's mode, in environments of their own."""
 
     @model_validator(mode="after")
     def _whole_steps(self) -> PPOSettings:
@@ -148,8 +153,8 @@ class PPO:
         """Segments of the last round's rollouts; before the first round, of the starting policy (query steps)."""
         rollout = self._recent
         if rollout is None:
-            envs = self._task.environments(self._settings.environments)
-            rollout = first_rollout(self._task, envs, lambda o: self.policy.act(o, rng), count, rng)
+            most = self._settings.environments
+            rollout = first_rollout(self._task, lambda o: self.policy.act(o, rng), count, most, rng)
             self._steps = self._steps.add(query=rollout.ends.size)
         return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias, cast
@@ -15,6 +16,8 @@ from prefrl.types import Evaluation, Floats, Segment, State
 Act: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
 """(n, O) observations -> (n, A) what the policy chose, and (n, A) what the environment is to execute."""
 EXAMPLES, EXAMPLE_SECONDS = 3, 4.0
+OVERLAP = 4
+"""How many segments of a first pool may share a step: an episode is not to be spent on every few segments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,9 +146,10 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
     )
 
 
-def first_rollout(task: ControlTask, envs: Environments, act: Act, count: int, rng: np.random.Generator) -> Rollout:
-    """What a starting policy does: an episode's steps in each environment, or more, so as to hold `count` windows."""
-    parts: list[Rollout] = []
+def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.random.Generator) -> Rollout:
+    """What a starting policy does: whole episodes that hold `count` windows, in at most `most` environments."""
+    wanted = math.ceil(count * task.segment_steps / (OVERLAP * task.horizon))
+    envs, parts = task.environments(min(max(wanted, 1), most)), list[Rollout]()
     observations = envs.reset(rng)
     while True:
         rollout, observations = collect(envs, observations, task.horizon, act)

@@ -44,6 +44,7 @@ class SB3Settings(Settings):
 
     kind: Literal["sb3"] = "sb3"
     algorithm: Literal["PPO", "SAC"] = "PPO"
+    """Which one of stable-baselines3's."""
     environments: int = Field(8, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
@@ -53,6 +54,7 @@ class SB3Settings(Settings):
     policy: dict[str, JsonValue] = Field(default_factory=dict)
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
     evaluation_episodes: int = Field(20, ge=1)
+    """Episodes of an evaluation, without exploration, in environments of their own."""
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
@@ -218,9 +220,9 @@ class SB3:
         """Segments of the last round; before the first round, of the starting policy (query steps)."""
         rollout = self._recent
         if rollout is None:
-            envs = self._task.environments(self._settings.environments)
             with seeded(rng):
-                rollout = first_rollout(self._task, envs, self._act(deterministic=False), count, rng)
+                act, most = self._act(deterministic=False), self._settings.environments
+                rollout = first_rollout(self._task, act, count, most, rng)
             self._steps = self._steps.add(query=rollout.ends.size)
         return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
 

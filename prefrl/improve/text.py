@@ -55,7 +55,7 @@ class TextSettings(Settings):
     (GRPO), or the batch's mean (REINFORCE)."""
     clip: float | None = Field(None, gt=0)
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
-    beta: float = Field(0.05, ge=0)
+    beta: float = Field(0.3, ge=0)
     """Weight of the KL to the starting policy, in units of reward a nat."""
     kl_in: Literal["reward", "loss"] = "reward"
     """Where the KL goes: into the reward (k1 of each token, before the baseline), or into the loss (k2)."""
@@ -65,9 +65,10 @@ class TextSettings(Settings):
     """Responses over which beta is steered."""
     reduction: Reduction = "constant"
     """How steps are averaged: `constant` (sums over a response), `token` or `sequence` (see docs)."""
-    learning_rate: float = Field(1e-3, gt=0)
+    learning_rate: float = Field(5e-4, gt=0)
     """Adam's; it does not change."""
     max_grad_norm: float = Field(1.0, gt=0)
+    """A gradient that is longer is shortened to this."""
     temperature: float = Field(1.0, gt=0)
     """Of sampling while learning and asking, and of every log-probability in the objective."""
     missing_end_penalty: float = Field(1.0, ge=0)

@@ -68,13 +68,13 @@ def test_every_step_of_the_environments_is_counted_once_by_purpose(store: Store[
     spent: list[int] = []
     learner = _learner(point(spent=spent))
     learner.sample(10, np.random.default_rng(0))
-    assert (sum(spent), learner.steps) == (80, Steps(query=80))
+    assert (sum(spent), learner.steps) == (20, Steps(query=20))
     learner.improve(Known(), store, np.random.default_rng(1))
-    assert (sum(spent), learner.steps) == (480, Steps(learn=400, query=80))
+    assert (sum(spent), learner.steps) == (420, Steps(learn=400, query=20))
     learner.sample(10, np.random.default_rng(2))
-    assert sum(spent) == 480
+    assert sum(spent) == 420
     learner.evaluate(Known(), np.random.default_rng(3))
-    assert (sum(spent), learner.steps) == (540, Steps(learn=400, query=80, evaluate=60))
+    assert (sum(spent), learner.steps) == (480, Steps(learn=400, query=20, evaluate=60))
 
 
 @pytest.mark.parametrize("rollout_steps", [7, 30, 64, 1000])
@@ -88,10 +88,10 @@ def test_segments_carry_gold_states_and_names_that_are_unique_in_the_run(store: 
     learner = _learner(point())
     pools = []
     for number in range(3):
-        pools.append(learner.sample(20, np.random.default_rng(number)))
+        pools.append(learner.sample(16, np.random.default_rng(number)))
         learner.improve(Known(), store, np.random.default_rng(number))
     segments = [s for pool in pools for s in pool]
-    assert len({s.id for s in segments}) == 60
+    assert len({s.id for s in segments}) == 48
     assert not {s.episode for s in pools[0]} & {s.episode for s in pools[1]}
     assert all(s.gold is not None and s.states is not None and len(s.gold) == len(s) == 5 for s in segments)
 

@@ -91,7 +91,9 @@ def test_the_optimum_is_the_reference_tilted_by_the_reward() -> None:
     logp = (token_logp(REF).sum(1) + REWARD / BETA).log_softmax(0)
     tilted = torch.empty_like(THETA)
     for row, prefix in enumerate(PREFIXES):
-        below = (SEQUENCES[:, : len(prefix)] == torch.tensor(prefix)).all(1) if prefix else torch.ones(27, dtype=torch.bool)
+        below = (
+            (SEQUENCES[:, : len(prefix)] == torch.tensor(prefix)).all(1) if prefix else torch.ones(27, dtype=torch.bool)
+        )
         for token in range(V):
             tilted[row, token] = logp[below & (SEQUENCES[:, len(prefix)] == token)].logsumexp(0)
     best = tilted.detach().requires_grad_()

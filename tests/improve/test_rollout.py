@@ -83,9 +83,9 @@ def test_parts_joined_are_what_one_collection_would_have_been() -> None:
 
 def test_a_first_rollout_goes_on_until_it_holds_enough() -> None:
     task = _task()
-    few = first_rollout(task, task.environments(2), _act, 3, np.random.default_rng(0))
-    many = first_rollout(task, task.environments(2), _act, 25, np.random.default_rng(0))
-    assert (few.ends.shape, many.ends.shape) == ((2, 7), (2, 21))
+    few = first_rollout(task, _act, 3, 2, np.random.default_rng(0))
+    many = first_rollout(task, _act, 25, 2, np.random.default_rng(0))
+    assert (few.ends.shape, many.ends.shape) == ((1, 7), (2, 21))
 
 
 def test_evaluation_means_over_first_episodes_only() -> None:

@@ -48,13 +48,13 @@ def test_every_step_of_the_environments_is_counted_once_by_purpose(
     spent: list[int] = []
     learner = _learner(point(spent=spent), algorithm)
     learner.sample(10, np.random.default_rng(0))
-    assert (sum(spent), learner.steps) == (40, Steps(query=40))
+    assert (sum(spent), learner.steps) == (20, Steps(query=20))
     learner.improve(Known(), store, np.random.default_rng(1))
-    assert (sum(spent), learner.steps) == (120, Steps(learn=80, query=40))
+    assert (sum(spent), learner.steps) == (100, Steps(learn=80, query=20))
     learner.evaluate(Known(), np.random.default_rng(3))
-    assert (sum(spent), learner.steps) == (180, Steps(learn=80, query=40, evaluate=60))
+    assert (sum(spent), learner.steps) == (160, Steps(learn=80, query=20, evaluate=60))
     segments = learner.sample(10, np.random.default_rng(2))
-    assert sum(spent) == 180
+    assert sum(spent) == 160
     assert all(s.gold is not None and s.states is not None and len(s) == 5 for s in segments)
 
 

@@ -23,8 +23,8 @@ def make(task: Reviews, train: Train = "full", members: int = 3, seed: int = 0) 
 
 def some(task: Reviews, count: int, seed: int = 0) -> list[Response]:
     """Reviews of very different lengths, with tokens."""
-    rng, found = np.random.default_rng(seed), []
-    for prompt, rest in (reviews().sample(rng) for _ in range(count)):
+    rng, grammar, found = np.random.default_rng(seed), reviews(), []
+    for prompt, rest in (grammar.sample(rng) for _ in range(count)):
         prompt_tokens = tuple(task.tokenizer.encode(prompt))
         tokens = (*task.tokenizer.encode(rest, add_special_tokens=False), int(task.tokenizer.eos_token_id))
         found.append(Response(prompt, rest, prompt_tokens, tokens))

@@ -1,0 +1,56 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prefrl import Config
+from prefrl.components import ConfigError
+from prefrl.envs.toys import INK, MARK, PointSettings
+from prefrl.store import Store
+from prefrl.types import Segment
+
+
+def test_the_point_moves_as_told_and_gold_is_its_closeness_to_the_middle(rng: np.random.Generator) -> None:
+    envs = PointSettings().build().environments(3)
+    before = envs.reset(rng)
+    step = envs.step(np.array([[1, 0], [0, -5], [0, 0]], np.float32))
+    moved = before + np.array([[0.1, 0], [0, -0.1], [0, 0]], np.float32)
+    np.testing.assert_allclose(step.final_observations, moved, atol=1e-6)
+    np.testing.assert_allclose(step.rewards, -np.linalg.norm(moved, axis=1), atol=1e-6)
+
+
+def test_an_episode_is_cut_at_its_horizon_and_never_terminates(rng: np.random.Generator) -> None:
+    envs = PointSettings(horizon=3).build().environments(2)
+    envs.reset(rng)
+    steps = [envs.step(np.zeros((2, 2), np.float32)) for _ in range(3)]
+    assert [s.truncated.all() for s in steps] == [False, False, True]
+    assert not any(s.terminated.any() for s in steps)
+
+
+def test_a_picture_shows_the_point_and_the_middle() -> None:
+    task = PointSettings(frame_size=90).build()
+    states = np.array([[1.0, 1.0], [-1.0, 0.0]])
+    segment = Segment(states.astype(np.float32), np.zeros((2, 2), np.float32), "e", 0, states)
+    frames = task.frames(segment)
+    assert frames.shape == (2, 90, 90, 3)
+    assert tuple(frames[0, 45, 45]) == MARK
+    assert tuple(frames[0, 15, 75]) == INK  # up and to the right
+    assert tuple(frames[1, 45, 15]) == INK
+    with pytest.raises(ValueError, match="simulator states"):
+        task.frames(Segment(segment.observations, segment.actions, "e", 0))
+
+
+def test_a_segment_longer_than_the_episode_is_refused() -> None:
+    with pytest.raises(ConfigError, match="segment of 9 steps is longer than an episode of 8"):
+        PointSettings(horizon=8, segment_steps=9).build()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_loop_learns_the_toy(seed: int, tmp_path: Path) -> None:
+    """Standing still gives about -31, the best there is about -4."""
+    with Store[Any](tmp_path) as store:
+        first, *_, last = Config.load("control/toy", [f"seed={seed}"]).build(store).run()
+    assert first.metrics["evaluate/gold"] < -25
+    assert last.metrics["evaluate/gold"] > -10
+    assert last.metrics["fit/accuracy_held_out"] > 0.7
