@@ -71,6 +71,7 @@ def fit_judged(
     held_out = split(data, judged, fitting.held_out)
     train, test = data.subset(~held_out), data.subset(held_out)
     stacked = reward.stack(data.candidates)
+    _check_finite(all_scores(reward, stacked), data)
     weight = _member_weights(train, reward.members, fitting.bootstrap, rng)
     epochs = _optimise(_Problem(reward, stacked, train, test, weight, fitting), rng)
     reward.settle(stacked)
@@ -144,7 +145,11 @@ def _optimise(problem: _Problem[C], rng: np.random.Generator) -> int:
 def _step(loss: Tensor, optimizer: torch.optim.Optimizer, parameters: Sequence[Tensor], max_grad_norm: float) -> None:
     optimizer.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
-    torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm, error_if_nonfinite=True)
+    norm = torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+    if not norm.isfinite():
+        raise FloatingPointError(
+            f"the gradient of the reward model's loss is {float(norm)}: lower fitting.learning_rate (the loss was {loss})"
+        )
     optimizer.step()
 
 

@@ -135,7 +135,12 @@ class TextLearner:
         return self._with_gold(drawn.candidates(self._task.tokenizer))
 
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
-        """`updates` batches of fresh responses; the metrics are means over them (`ratio_error`: the largest)."""
+        """`updates` batches of fresh responses; the metrics are means over them.
+
+        reward and reward_std (learned scores before penalties), kl (k1, nats per response), entropy (nats per token:
+        minus the mean log-probability of what was sampled), length (tokens), ended (share), beta, loss, grad_norm
+        (before clipping), and ratio_error: the largest |pi / pi_old - 1| before a batch's first step, 0 but for rounding.
+        """
         seen: dict[str, list[float]] = defaultdict(list)
         for _ in range(self._settings.updates):
             prompts = self._task.prompts(self._settings.prompts, rng)
@@ -216,7 +221,7 @@ class TextLearner:
             "reward": float(raw.mean()),
             "reward_std": float(raw.std(correction=0)),
             "kl": sequence_kl,
-            "surprise": -float(batch.logp.sum() / batch.count),
+            "entropy": -float(batch.logp.sum() / batch.count),
             "length": float(lengths.mean()),
             "ended": float(batch.ended.float().mean()),
             "beta": self._kl.beta,
