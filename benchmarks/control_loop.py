@@ -102,7 +102,7 @@ def ours(seed: int) -> dict[str, float]:
 
 
 def peer(seed: int) -> dict[str, float]:
-    """imitation's tutorial "Learning a Reward Function using Preference Comparisons", with a seed and a step counter."""
+    """The tutorial "Learning a Reward Function using Preference Comparisons", with a seed and a step counter."""
     import gymnasium
     import numpy as np
     import torch

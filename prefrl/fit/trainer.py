@@ -148,7 +148,8 @@ def _step(loss: Tensor, optimizer: torch.optim.Optimizer, parameters: Sequence[T
     norm = torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm)
     if not norm.isfinite():
         raise FloatingPointError(
-            f"the gradient of the reward model's loss is {float(norm)}: lower fitting.learning_rate (the loss was {loss})"
+            f"the gradient of the reward model's loss is {float(norm)}, and the loss {float(loss)}: "
+            "lower fitting.learning_rate"
         )
     optimizer.step()
 

@@ -137,9 +137,9 @@ class TextLearner:
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
         """`updates` batches of fresh responses; the metrics are means over them.
 
-        reward and reward_std (learned scores before penalties), kl (k1, nats per response), entropy (nats per token:
+        reward and reward_std (learned scores before penalties), kl (k1, nats per response), surprise (nats per token:
         minus the mean log-probability of what was sampled), length (tokens), ended (share), beta, loss, grad_norm
-        (before clipping), and ratio_error: the largest |pi / pi_old - 1| before a batch's first step, 0 but for rounding.
+        (before clipping), and ratio_error: the largest |pi / pi_old - 1| before a batch's first step, 0 to rounding.
         """
         seen: dict[str, list[float]] = defaultdict(list)
         for _ in range(self._settings.updates):
@@ -221,7 +221,7 @@ class TextLearner:
             "reward": float(raw.mean()),
             "reward_std": float(raw.std(correction=0)),
             "kl": sequence_kl,
-            "entropy": -float(batch.logp.sum() / batch.count),
+            "surprise": -float(batch.logp.sum() / batch.count),
             "length": float(lengths.mean()),
             "ended": float(batch.ended.float().mean()),
             "beta": self._kl.beta,
