@@ -82,7 +82,7 @@ class Locomotion:
         truncated = (self._elapsed >= self._horizon) & ~terminated
         final = observations = self._observe()
         ended = np.flatnonzero(terminated | truncated)
-        for i in ended:
+        for i in ended.tolist():
             self._start(i)
         if len(ended):
             observations = self._observe()
@@ -112,7 +112,8 @@ class Locomotion:
         clip, observations = self._body.velocity_clip, self._states[:, 1:].copy()
         velocities = observations[:, self._model.nq - 1 :]
         np.clip(velocities, -clip, clip, out=velocities)
-        return observations.astype(np.float32)
+        found: Floats = observations.astype(np.float32)
+        return found
 
     def _healthy(self) -> Bools:
         body, states = self._body, self._states
@@ -129,4 +130,5 @@ class Locomotion:
         speed = (self._states[:, 0] - before) / self._dt
         rewards: Floats = speed if self._body.height is None else speed + healthy * 1.0
         # The cost is in the actions' float32, as in gymnasium.
-        return rewards - self._body.control_cost * np.square(actions).sum(1)
+        costs: Floats = self._body.control_cost * np.square(actions).sum(1)
+        return rewards - costs

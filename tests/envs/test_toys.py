@@ -21,7 +21,7 @@ def test_the_point_moves_as_told_and_gold_is_its_closeness_to_the_middle(rng: np
 
 
 def test_an_episode_is_cut_at_its_horizon_and_never_terminates(rng: np.random.Generator) -> None:
-    envs = PointSettings(horizon=3).build().environments(2)
+    envs = PointSettings(horizon=3, segment_steps=2).build().environments(2)
     envs.reset(rng)
     steps = [envs.step(np.zeros((2, 2), np.float32)) for _ in range(3)]
     assert [s.truncated.all() for s in steps] == [False, False, True]
