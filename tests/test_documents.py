@@ -1,5 +1,6 @@
 """Every command and code block of the documents runs, in an empty folder where the demo's runs lie, at toy size."""
 
+import json
 import os
 import re
 import subprocess
@@ -52,6 +53,14 @@ def test_every_block_runs(path: Path, workshop: Path, monkeypatch: pytest.Monkey
         else:
             lines = [line for line in code.splitlines() if line.split("#")[0].strip() not in RUN_BY_CI]
             run("\n".join(lines), workshop)
+
+
+@pytest.mark.slow
+def test_every_logged_number_is_explained(workshop: Path) -> None:
+    explained = (ROOT / "docs/metrics.md").read_text()
+    for path in workshop.glob("runs/*/metrics.jsonl"):
+        for key in {key for line in path.read_text().splitlines() for key in json.loads(line)}:
+            assert f"`{key.removesuffix('_held_out')}`" in explained, f"{key} is missing in docs/metrics.md"
 
 
 def test_links_between_documents_lead_somewhere() -> None:

@@ -95,11 +95,11 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(name: str, tmp_path: 
 def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
     finish("control/toy", tmp_path / "run")
     finish("control/toy", tmp_path / "whole")
-    broken = tmp_path / "run/checkpoints/round-0003/learner.safetensors"
+    broken = max((tmp_path / "run/checkpoints").iterdir()) / "learner.safetensors"
     broken.write_bytes(broken.read_bytes()[:-1])
     with Run.resume(tmp_path / "run") as run:
         assert "learner.safetensors" in run.notes[0]
-        assert run.notes[1] == "going on after round 2"
+        assert run.notes[1] == f"going on after round {run.config.loop.rounds - 1}"
         list(run)
     assert weights(tmp_path / "run") == weights(tmp_path / "whole")
 
@@ -119,7 +119,7 @@ def test_a_finished_run_is_left_as_it_is(tmp_path: Path) -> None:
     before = weights(tmp_path / "run")
     finish("control/toy", tmp_path / "run")
     assert weights(tmp_path / "run") == before
-    assert len(numbers(tmp_path / "run")) == 4
+    assert len(numbers(tmp_path / "run")) == Config.load("control/toy").loop.rounds + 1
 
 
 def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) ->
 
 def test_a_checkpoint_holds_all_that_is_needed_to_use_it(tmp_path: Path) -> None:
     finish("control/toy", tmp_path / "run")
-    shutil.copytree(tmp_path / "run/checkpoints/round-0003", tmp_path / "alone")
+    shutil.copytree(max((tmp_path / "run/checkpoints").iterdir()), tmp_path / "alone")
     saved = open_saved(tmp_path / "alone")
     assert saved.config == Config.load("control/toy")
     assert load_state(saved.folder, "learner")["steps"][0] > 0
