@@ -1,6 +1,6 @@
 """One RLOO update of a 1M-parameter Llama: prefrl's text learner against TRL's RLOOTrainer, at equal work.
 
-    python benchmarks/text_loop.py [--short] [--peers .venv-peers/bin/python]
+    python benchmarks/text_loop.py [--short] [--peers .venv-peers-text/bin/python]
 
 Both start from the same weights and prompts: 16 prompts x 4 responses of 48 tokens, KL to a reference at 0.05, one
 Adam step, float32, no dropout, no gradient checkpointing, one thread each. The two processes take turns, an update
@@ -29,7 +29,9 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HF_HUB_OFFLINE": 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--short", action="store_true", help="fewer repetitions: under two minutes")
-    parser.add_argument("--peers", default=".venv-peers/bin/python", help="Python of the environment that holds TRL")
+    parser.add_argument(
+        "--peers", default=".venv-peers-text/bin/python", help="Python of the environment that holds TRL"
+    )
     parser.add_argument("--worker", choices=["ours", "peer"], help=argparse.SUPPRESS)
     parser.add_argument("--folder", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -37,7 +39,7 @@ def main() -> None:
         {"ours": ours, "peer": peer}[options.worker](Path(options.folder))
         return
     if not Path(options.peers).exists():
-        sys.exit(f"no {options.peers}: make an environment, pip install -r benchmarks/peers-text.txt, and say --peers")
+        sys.exit(f"no {options.peers}: run `make peers`, or install benchmarks/peers-text.txt and say --peers")
     with tempfile.TemporaryDirectory() as folder:
         make_model(Path(folder))
         print(json.dumps(compare(Path(folder), options.peers, 5 if options.short else 20) | {"short": options.short}))

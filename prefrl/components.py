@@ -65,6 +65,7 @@ EXTRAS = {
     "stable_baselines3": "control",
     "transformers": "text",
     "tokenizers": "text",
+    "datasets": "text",
     "vaderSentiment": "text",
     "av": "label",
 }

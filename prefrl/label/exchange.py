@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -48,15 +49,16 @@ def export_preferences(store: Store[Any], path: Path) -> Exported:
 
 
 def import_preferences(path: Path, store: Store[Response]) -> int:
-    """Read `prompt`, `chosen`, `rejected` lines into a store, all or none; returns the number of rows.
+    """Read `prompt`, `chosen`, `rejected` rows into a store, all or none; returns the number of rows.
 
+    JSON lines, or a table that `datasets` reads: .csv or .parquet.
     Raises `ValueError` with the number of each bad row (the first 20). A pair that comes again is another judgement
     of the same query, by "file#2" and so on: contradictions are kept, not resolved.
     """
     rows, errors = [], []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+    for number, row in enumerate(_rows(path), 1):
         try:
-            rows.append(_parse(line))
+            rows.append(_parse(row))
         except ValueError as error:
             errors.append(f"row {number}: {error}")
     if errors:
@@ -75,9 +77,22 @@ def import_preferences(path: Path, store: Store[Response]) -> int:
     return len(rows)
 
 
-def _parse(line: str) -> tuple[Query[Response], str]:
+def _rows(path: Path) -> Iterator[Any]:
+    """Lines of JSON, or the rows of a table as dicts."""
+    if path.suffix not in (".csv", ".parquet"):
+        yield from path.read_text(encoding="utf-8-sig").splitlines()
+        return
+    from datasets import Dataset
+
+    with tempfile.TemporaryDirectory() as cache:
+        read = Dataset.from_csv if path.suffix == ".csv" else Dataset.from_parquet
+        yield from read(str(path), cache_dir=cache, keep_in_memory=True)
+
+
+def _parse(row: Any) -> tuple[Query[Response], str]:
     """A row as a query and the id of the chosen response."""
-    row = json.loads(line, parse_constant=_no_constant)
+    if isinstance(row, str):
+        row = json.loads(row, parse_constant=_no_constant)
     if not isinstance(row, dict):
         raise ValueError(f"expected an object, got {type(row).__name__}")
     for name in COLUMNS:

@@ -42,6 +42,20 @@ def test_a_ranking_goes_out_as_its_pairs_and_ties_are_counted(text_store: Store[
         assert by_text[row["chosen"]] < by_text[row["rejected"]]
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_tables_are_read_as_well(text_store: Store[Response], tmp_path: Path, suffix: str) -> None:
+    datasets = pytest.importorskip("datasets")
+    table = datasets.Dataset.from_list([GOOD, {"prompt": 'q, "r"', "chosen": "a\nb", "rejected": "c"}])
+    path = tmp_path / f"in{suffix}"
+    (table.to_csv if suffix == ".csv" else table.to_parquet)(str(path))
+    assert import_preferences(path, text_store) == 2
+    assert {c.text for j in text_store.judged() for c in j.query.candidates} == {"yes", "no", "a\nb", "c"}
+    broken = datasets.Dataset.from_list([GOOD, GOOD | {"chosen": None}])
+    (broken.to_csv if suffix == ".csv" else broken.to_parquet)(str(path))
+    with pytest.raises(ValueError, match="row 2: column 'chosen': expected a string, got None"):
+        import_preferences(path, text_store)
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [
