@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from enum import StrEnum
@@ -21,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`) or a YAML file.")]
+Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
 Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
@@ -77,14 +78,18 @@ def label(
 ) -> None:
     """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
     from prefrl import stages
-    from prefrl.console import console
+    from prefrl.console import say
     from prefrl.rundir import open_saved
 
     policy = open_saved(source) if Path(source).is_dir() else None
     path = str(policy.folder / "config.yaml") if policy else source
-    extra = ["labeler.kind=terminal", f"labeler.clips={out / 'clips'}"] if terminal else []
-    counts = stages.label(_load(path, [*extra, *(overrides or [])]), out, policy, given)
-    console.print(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skips, in {out}")
+    extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(out / 'clips'))}"] if terminal else []
+    try:
+        counts = stages.label(_load(path, [*extra, *(overrides or [])]), out, policy, given)
+    except KeyboardInterrupt:
+        say(f"stopped; what was answered is in {out}. Go on with the same command")
+        raise
+    say(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skips, in {out}")
 
 
 @app.command()
@@ -131,10 +136,10 @@ def evaluate(folder: Folder) -> None:
 @app.command()
 def report(folder: Folder) -> None:
     """Write a run's report.html again, also while it goes on."""
-    from prefrl.console import console
+    from prefrl.console import say
     from prefrl.evaluate.report import write_report
 
-    console.print(f"report: {write_report(folder)}")
+    say(f"report: {write_report(folder)}")
 
 
 @app.command("export")
@@ -146,13 +151,13 @@ def export_(
     ] = Form.preferences,
 ) -> None:
     """Write judgements to files."""
-    from prefrl.console import console
+    from prefrl.console import say
     from prefrl.label.exchange import export_bundle, export_preferences
     from prefrl.store import Store
 
     with Store[Any](store, write=False) as opened:
         done = (export_preferences if form is Form.preferences else export_bundle)(opened, to)
-    console.print(f"{done.written} written to {to}" + (f", {done.ties} ties left out" if done.ties else ""))
+    say(f"{done.written} written to {to}" + (f", {done.ties} ties left out" if done.ties else ""))
 
 
 @app.command("import")
@@ -161,13 +166,13 @@ def import_(
     out: Out = Path("labels"),
 ) -> None:
     """Read judgements from files into a store, all or none."""
-    from prefrl.console import console
+    from prefrl.console import say
     from prefrl.label.exchange import import_bundle, import_preferences
     from prefrl.store import Store
 
     with Store[Any](out) as store:
         count = import_bundle(path, store) if path.is_dir() else import_preferences(path, store)
-    console.print(f"{count} judgements read into {out}")
+    say(f"{count} judgements read into {out}")
 
 
 @app.command()
@@ -207,37 +212,46 @@ def doctor() -> None:
 
 
 def _load(source: str, overrides: list[str] | None) -> Config:
+    """Settings from a preset, a file, or a folder that holds a config.yaml."""
     from prefrl.config import Config
 
+    if Path(source).is_dir():
+        source = str(Path(source) / "config.yaml")
     return Config.load(source, overrides or [])
 
 
 def _drive(running: Run) -> None:
     """Run to the end, telling how it goes; on Ctrl-C say how to go on."""
-    from prefrl.console import console, progress, round_line, summary_table
+    from prefrl.console import console, progress, round_line, say, summary_table
 
     with running:
         for note in running.notes:
-            console.print(note, style="yellow")
+            say(note, "yellow")
         person = running.config.labeler.model_dump()["kind"] == "terminal"
         try:
             with progress(running.loop, quiet=person) as bar:
                 for round in running:
                     bar.update(bar.task_ids[0], completed=round.number)
                     console.print(round_line(round))
+                    for note in round.notes:
+                        say(f"  {note}", "yellow")
         except KeyboardInterrupt:
-            console.print(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
+            say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
             raise
         console.print(summary_table(running.summary))
-        console.print(f"report: {running.report()}")
+        say(f"report: {running.report()}")
+        if not running.loop.reward.fitted:
+            raise ValueError(
+                "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
+            )
 
 
 def _dry_run(config: Config) -> None:
-    from prefrl.console import console, duration
+    from prefrl.console import duration, say
     from prefrl.stages import estimate
 
     seconds = estimate(config)
-    console.print(f"everything builds and one small round runs; the whole would take about {duration(seconds)}")
+    say(f"everything builds and one small round runs; the whole would take about {duration(seconds)}")
 
 
 def main() -> None:
@@ -246,7 +260,7 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         sys.exit(130)
-    except (ValueError, FloatingPointError, ModuleNotFoundError) as error:
+    except (ValueError, FloatingPointError, ModuleNotFoundError, OSError) as error:
         if os.environ.get("PREFRL_DEBUG"):
             raise
         from prefrl.components import missing

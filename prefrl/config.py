@@ -69,8 +69,8 @@ class Config(Settings):
         Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
         """
         data = _read(source)
-        for override in overrides:
-            _apply(data, override)
+        for override in sorted(overrides, key=lambda o: not o.partition("=")[0].endswith("kind")):
+            _apply(data, override)  # kinds first: a new kind drops what was set for the old one
         return cls.parse(data)
 
     @classmethod

@@ -48,7 +48,8 @@ def progress(loop: Loop[Any], quiet: bool) -> Iterator[Progress]:
     )
     with bar:
         total = loop.settings.rounds
-        bar.add_task("run", total=total, completed=max(loop.round, 0), spent=sum(loop.learner.steps))
+        begun = max(loop.round, 0)
+        bar.add_task("run", total=total, completed=begun, begun=begun, spent=sum(loop.learner.steps))
         yield bar
 
 
@@ -56,11 +57,16 @@ class _TimeLeft(ProgressColumn):
     """Time left by the pace of the rounds so far."""
 
     def render(self, task: Row) -> Text:
-        done = task.completed - task.fields.get("begun", 0)
+        done = task.completed - task.fields["begun"]
         if not done or not task.total or task.elapsed is None:
             return Text("")
         left = task.elapsed / done * (task.total - task.completed)
         return Text(f"about {duration(left)} left", style="dim")
+
+
+def say(text: str, style: str = "") -> None:
+    """One line as it is: names of files are no markup, and are not broken over lines."""
+    console.print(Text(text, style=style), soft_wrap=True)
 
 
 def round_line(round: Round[Any]) -> Text:
@@ -86,7 +92,8 @@ def round_line(round: Round[Any]) -> Text:
 
 def summary_table(summary: Mapping[str, Any]) -> Table:
     """`summary.json` for people."""
-    table = Table(title=f"{summary['task']} ({summary['kind']}), seed {summary['seed']}", show_header=False, box=None)
+    title = Text(f"{summary['task']} ({summary['kind']}), seed {summary['seed']}")
+    table = Table(title=title, show_header=False, box=None)
     gold = f"{number(summary['gold_before'])} → {number(summary['gold_after'])} (best {number(summary['gold_best'])})"
     table.add_row("gold", Text(gold, style="bold blue"))
     table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
@@ -106,7 +113,7 @@ def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
 
 def table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
     """A plain table; cells are text, never markup."""
-    made = Table(title=title, title_justify="left")
+    made = Table(title=Text(title), title_justify="left")
     for column in columns:
         made.add_column(column, overflow="fold")
     for row in rows:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,19 +20,27 @@ class DamagedError(ValueError):
 
 def write_file(path: Path, data: bytes) -> None:
     """Write a whole file or nothing: temporary file beside it, fsync, rename, fsync of the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
+    make_folder(path.parent)
+    work = _beside(path)
     try:
-        with os.fdopen(handle, "wb") as file:
+        # Not tempfile: its files are private whatever the umask says, and a store is to be shared as the user wishes.
+        with os.fdopen(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
+        os.replace(work, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        work.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder with what is above it, so that it survives a crash: an entry is only safe once its folder is."""
+    missing = [f for f in (folder, *folder.parents) if not f.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for made in missing:
+        sync_folder(made.parent)
 
 
 def sync_folder(folder: Path) -> None:
@@ -46,22 +54,60 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Fill a temporary folder; on success it gets a manifest and takes the place of `path` in one rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}-"))
+    """Fill a temporary folder; on success it gets a manifest and takes the place of `path` in one rename.
+
+    Raises `ValueError` where `path` holds anything that an earlier `whole_folder` did not put there.
+    """
+    check_free(path)
+    make_folder(path.parent)
+    work = _beside(path)
+    work.mkdir()
     try:
         yield work
         files = sorted(p for p in work.rglob("*") if p.is_file())
         hashes = {p.relative_to(work).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
         write_file(work / MANIFEST, json.dumps(hashes, indent=1).encode())
-        work.chmod(0o755)
-        if path.exists():
-            shutil.rmtree(path)
-        os.rename(work, path)
-        sync_folder(path.parent)
+        _replace(path, work)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
+
+
+def check_free(path: Path) -> None:
+    """Raise `ValueError` unless a folder may be replaced: it is missing, empty, or was written by `whole_folder`."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise ValueError(f"{path} is a file: choose another folder")
+    found = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
+    try:
+        ours = {MANIFEST, *json.loads((path / MANIFEST).read_text())}
+    except (OSError, ValueError):
+        ours = set()
+    if strangers := sorted(found - ours):
+        raise ValueError(f"{path} holds other things ({strangers[0]}), which would be lost: choose another folder")
+
+
+def _replace(path: Path, work: Path) -> None:
+    """Put `work` in the place of `path`; what was there is only removed once that is done."""
+    aside = _beside(path)
+    if path.exists():
+        os.rename(path, aside)
+    os.rename(work, path)
+    sync_folder(path.parent)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _beside(path: Path) -> Path:
+    """A hidden name in the same folder that nothing else has."""
+    return path.parent / f".{path.name}-{uuid.uuid4().hex[:12]}"
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """The lines of a UTF-8 file, cut at line feeds alone: in JSON lines other separators belong to the text."""
+    with path.open(encoding="utf-8-sig", newline="\n") as file:
+        for line in file:
+            yield line.rstrip("\r\n")
 
 
 def verify(folder: Path) -> None:

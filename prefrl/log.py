@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import sqlite3
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -80,7 +81,9 @@ class EventLog:
         """Add the events whose id is new, in one transaction that is on disk when this returns."""
         if self._owner is None:
             raise StoreError(f"the store in {self.folder} was opened for reading only")
-        fresh = {one["id"]: one for one in rows}
+        fresh: dict[str, dict[str, Any]] = {}
+        for one in rows:
+            fresh.setdefault(one["id"], one)
         with self._engine.begin() as connection:
             ids = list(fresh)
             for i in range(0, len(ids), 500):  # databases limit the number of parameters of a statement
@@ -131,8 +134,8 @@ def _engine(folder: Path, write: bool, url: str | None) -> sql.Engine:
     if url is not None:
         return sql.create_engine(url)
     path = (folder / "store.db").absolute()
-    # Reading must work on folders that may not be written to, and must never create a file.
-    engine = sql.create_engine(f"sqlite:///file:{path.as_uri()[7:]}?mode={'rwc' if write else 'ro'}&uri=true")
+    uri = f"{path.as_uri()}?mode={'rwc' if write else 'ro'}"  # a reader must not make a store where there is none
+    engine = sql.create_engine("sqlite://", creator=lambda: sqlite3.connect(uri, uri=True), poolclass=sql.QueuePool)
     sql.event.listen(engine, "connect", _on_connect if write else _on_connect_reader)
     sql.event.listen(
         engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")

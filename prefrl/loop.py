@@ -69,6 +69,7 @@ class Loop(Generic[C]):
     stage: str = "start"
     """What is going on, for whoever watches."""
     _seconds: Metrics = field(default_factory=dict)
+    _notes: list[str] = field(default_factory=list)
 
     def run(self) -> Iterator[Round[C]]:
         """Go on from where the loop stands to the last round."""
@@ -84,7 +85,7 @@ class Loop(Generic[C]):
         """One turn of the loop: the five stages, in order."""
         number = self.round + 1
         rng = streams(self.seed, number)
-        self._ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
+        self.ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
         with self._timed("label"):
             self.labeler.answer(self.store, rng.label)
         fitted = self._fit(rng)
@@ -94,25 +95,37 @@ class Loop(Generic[C]):
                 improved = self.learner.improve(self.reward, self.store, rng.improve)
         return self._finish(number, improved, self._evaluate(rng), fitted)
 
-    def _ask(self, count: int, rng: Streams) -> None:
-        """Sample a pool, and ask about the part of it that is worth a label."""
+    def ask(self, count: int, rng: Streams) -> None:
+        """Stage 1: sample a pool, and ask about the part of it that is worth a label.
+
+        Raises `ValueError` where no two candidates of the pool can be compared.
+        """
         if count <= 0:
             return
         with self._timed("sample"):
             pool = self.learner.sample(int(count * self.candidates * self.settings.pool), rng.sample)
             queries = self.selector.select(pool, self.reward, count, rng.select)
             if len(queries) < count:
-                raise ValueError(
-                    f"{count} queries of {self.candidates} were wanted, but {len(pool)} sampled candidates gave only "
-                    f"{len(queries)}: raise loop.pool (now {self.settings.pool}) or lower loop.labels"
-                )
+                self._note_shortage(len(queries), count, len(pool))
             self.store.ask(queries)
+
+    def _note_shortage(self, found: int, wanted: int, pool: int) -> None:
+        """A pool may hold too few candidates that can be compared; none at all is a mistake in the settings."""
+        text = f"{pool} sampled candidates gave {found} of {wanted} queries of {self.candidates}"
+        if not found:
+            raise ValueError(
+                f"{text}: raise loop.pool (now {self.settings.pool}), or let the learner sample more that can be "
+                "compared (for text learner.asked_responses, for control shorter segments)"
+            )
+        self._notes.append(text)
 
     def _fit(self, rng: Streams) -> Fitted | None:
         with self._timed("fit"):
             try:
                 return fit(self.reward, self.store, self.fitting, rng.fit)
-            except NothingToFit:  # people may not have answered yet: what is known stays, the next round asks again
+            except NothingToFit as error:  # people may not have answered yet: what is known stays
+                if self.settings.labels:
+                    self._notes.append(f"nothing to fit: {error}")
                 return None
 
     def _evaluate(self, rng: Streams) -> Evaluation[C]:
@@ -131,9 +144,10 @@ class Loop(Generic[C]):
         }
         if not self.reward.fitted:
             stages["evaluate"].pop("learned", None)  # what an unfitted network says means nothing
-        self.round, self._seconds, self.stage = number, {}, "idle"
+        notes = tuple(self._notes)
+        self.round, self._seconds, self._notes, self.stage = number, {}, [], "idle"
         metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
-        return Round(number, metrics, evaluated.examples, fitted)
+        return Round(number, metrics, evaluated.examples, fitted, notes)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

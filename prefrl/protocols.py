@@ -187,6 +187,9 @@ class RewardModel(Protocol[C_contra]):
     def settle(self, stacked: Mapping[str, torch.Tensor]) -> None:
         """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates."""
 
+    def raw_member_scores(self, candidates: Sequence[C_contra]) -> Floats:
+        """(E, N) the scores that the likelihood was fitted on, without gradients; changes nothing."""
+
     def member_scores(self, candidates: Sequence[C_contra]) -> Floats:
         """(E, N) scores after each member's shift and scale, without gradients."""
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from prefrl.checkpoints import load_state, save_state
+from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.examples import save_examples
 from prefrl.evaluate.report import write_report
@@ -40,16 +41,19 @@ class Run:
     """
 
     def __init__(self, config: Config, folder: str | Path, reward: Path | None = None) -> None:
-        """Make or reopen the folder and build everything in it. `reward`: start from the reward model saved there."""
+        """Make or reopen the folder and build everything in it.
+
+        `reward`: start from the reward model saved there; the run keeps a copy, and always starts from that one.
+        """
         self.config, self.folder = config, Path(folder)
         self.notes: list[str] = []
         """What a person should know about the start: from where it goes on, which checkpoints were damaged."""
-        _claim(config, self.folder)
+        _refuse_strangers(self.folder)
         self.store: Store[Any] = Store(self.folder)
         try:
+            _claim(config, self.folder, self.store)
             self.loop: Loop[Any] = config.build(self.store)
-            if reward is not None:
-                self.loop.reward.load(load_state(_newest(reward)[0], "reward"))
+            self._start_from(reward)
             self._rows = self._restore()
             self._events = _events(self.folder, self.loop.round)
         except BaseException:
@@ -86,6 +90,24 @@ class Run:
         """Write `report.html`, and say where it is."""
         return write_report(self.folder)
 
+    def _start_from(self, reward: Path | None) -> None:
+        """Load the reward model that the run improves against, if there is one; keep it in the folder first."""
+        kept = self.folder / "reward"
+        if reward is not None:
+            given = open_saved(reward)
+            if given.config.task != self.config.task:
+                difference = _difference(given.config.task, self.config.task)
+                raise RunError(f"{reward} was fitted on another task (task.{difference})")
+            if kept.exists() and _hash(kept) != _hash(given.folder):
+                raise RunError(
+                    f"{self.folder} improves against another reward model than {reward}: choose another folder"
+                )
+            if not kept.exists():
+                save_reward(kept, self.config, given.reward(self.loop.task))
+        if kept.exists():
+            verify(kept)
+            self.loop.reward.load(load_state(kept, "reward"))
+
     def _record(self, round: Round[Any]) -> None:
         """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""
         row = {"round": round.number} | {k: v if math.isfinite(v) else None for k, v in round.metrics.items()}
@@ -117,7 +139,12 @@ class Run:
             shutil.rmtree(old)
 
     def _restore(self) -> list[dict[str, Any]]:
-        """Load the newest good checkpoint, and the rows of metrics up to it."""
+        """Load the newest good checkpoint, and the rows of metrics up to it.
+
+        Labels that came after that checkpoint stay in the store, and count from the next fit on.
+        """
+        for unfinished in (self.folder / "checkpoints").glob(".round-*"):
+            shutil.rmtree(unfinished)
         if not _checkpoints(self.folder):
             return []
         folder, damaged = _newest(self.folder)
@@ -165,22 +192,36 @@ def saved_config(folder: Path) -> Config:
     return Config.load(folder / "config.yaml")
 
 
-def _claim(config: Config, folder: Path) -> None:
-    """Make the folder for these settings, or see that it is for these settings already."""
-    path, wanted = folder / "config.yaml", config.dump()
-    if not path.exists():
-        strangers = [p.name for p in folder.iterdir() if p.name[0] != "."] if folder.exists() else []
-        if strangers:
-            raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
-        write_file(path, wanted.encode())
-    elif (found := Config.load(path)) != config:
-        raise RunError(
-            f"{folder} holds a run with other settings ({_difference(found, config)}): choose another folder"
-        )
+def _refuse_strangers(folder: Path) -> None:
+    """Raise `RunError` where a folder holds things but no settings, so that it is not ours."""
+    if folder.exists() and not folder.is_dir():
+        raise RunError(f"{folder} is a file: choose another folder")
+    found = {p.name for p in folder.iterdir()} if folder.exists() else set()
+    strangers = sorted(name for name in found if name[0] != "." and name.split(".")[0] not in ("store", "owner"))
+    if strangers and "config.yaml" not in found:
+        raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
 
 
-def _difference(a: Config, b: Config) -> str:
-    """The first setting in which two configs differ."""
+def _claim(config: Config, folder: Path, store: Store[Any]) -> None:
+    """Make the folder one of these settings, or see that it is already.
+
+    Where nothing has happened yet, because a start failed, new settings take the place of the old ones.
+    """
+    path = folder / "config.yaml"
+    begun = bool(_checkpoints(folder)) or store.sequence > 0
+    if path.exists() and begun and (found := Config.load(path)) != config:
+        difference = _difference(found, config)
+        raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")
+    write_file(path, config.dump().encode())
+
+
+def _hash(saved: Path) -> str:
+    """Of the weights of a saved reward model."""
+    return hashlib.sha256((saved / "reward.safetensors").read_bytes()).hexdigest()
+
+
+def _difference(a: Settings, b: Settings) -> str:
+    """The first setting in which two groups of settings differ."""
     flat_a, flat_b = (dict(_flatten(c.model_dump(mode="json"))) for c in (a, b))
     key = next(k for k in [*flat_a, *flat_b] if flat_a.get(k) != flat_b.get(k))
     return f"{key} is {flat_a.get(key)} there, {flat_b.get(key)} here"
@@ -196,7 +237,7 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 
 def _checkpoints(folder: Path) -> list[Path]:
     """Newest first."""
-    return sorted((p for p in folder.glob("checkpoints/round-*") if re.search(r"\d$", p.name)), reverse=True)
+    return sorted(folder.glob("checkpoints/round-*"), key=lambda p: int(p.name.removeprefix("round-")), reverse=True)
 
 
 def _newest(folder: Path) -> tuple[Path, list[str]]:

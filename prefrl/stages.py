@@ -13,12 +13,11 @@ import numpy as np
 from prefrl.checkpoints import load_state
 from prefrl.components import Settings
 from prefrl.config import Config
-from prefrl.files import write_file
+from prefrl.files import check_free, read_lines, write_file
 from prefrl.fit.trainer import fit
 from prefrl.label.exchange import import_preferences
-from prefrl.loop import Loop
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
-from prefrl.seeding import Streams, streams
+from prefrl.seeding import streams
 from prefrl.store import Store
 from prefrl.types import Evaluation, Fitted, Query, Response
 
@@ -27,37 +26,47 @@ def label(config: Config, folder: Path, policy: Saved | None = None, given: Path
     """Ask `loop.labels` queries in the store of a folder, and have the labeler answer them; returns the counts.
 
     Candidates come from the starting policy, from a run's `policy`, or from a file of `given` responses. Calling it
-    again on the same folder goes on where it stopped.
+    again on the same folder goes on where it stopped, and asks more if `loop.labels` is higher. Raises `RunError` for
+    the folder of a run, whose labels are its own.
     """
-    _keep_config(config, folder)
+    if (folder / "checkpoints").exists():
+        raise RunError(f"{folder} holds a run, which asks for its own labels: choose another folder")
     with Store[Any](folder) as store:
+        _keep_config(config, folder)
         loop = config.build(store)
         if policy is not None:
             loop.learner.load(load_state(policy.folder, "learner"))
-        rng = streams(config.seed, 1)
-        if not store.counts()["asked"]:
-            store.ask(read_queries(given, loop.task) if given else _sampled(loop, rng))
-        loop.labeler.answer(store, rng.label)
+            loop.reward.load(load_state(policy.folder, "reward"))
+        asked = store.counts()["asked"]
+        if given:
+            store.ask(read_queries(given, loop.task))
+        else:
+            loop.ask(config.loop.labels - asked, streams(config.seed, 1 + asked))
+        loop.labeler.answer(store, streams(config.seed, 1).label)
         return store.counts()
-
-
-def _sampled(loop: Loop[Any], rng: Streams) -> list[Query[Any]]:
-    count = loop.settings.labels
-    pool = loop.learner.sample(int(count * loop.candidates * loop.settings.pool), rng.sample)
-    return loop.selector.select(pool, loop.reward, count, rng.select)
 
 
 def read_queries(path: Path, task: Any) -> list[Query[Response]]:
     """Queries from JSON lines `{"prompt": ..., "responses": [...]}`. Raises `ValueError` with the row's number."""
+    if task.kind != "text":
+        raise ValueError(f"{path} holds responses to prompts, but {task.name} is no text task")
     queries = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+    for number, line in enumerate(read_lines(path), 1):
         try:
-            row = json.loads(line)
-            responses = [Response(str(row["prompt"]), str(text)) for text in row["responses"]]
-            queries.append(Query(tuple(_with_gold(responses, task))))
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: row {number}: expected a prompt and its responses: {error}") from error
+            queries.append(Query(tuple(_with_gold(_responses(json.loads(line)), task))))
+        except ValueError as error:
+            raise ValueError(f"{path}: row {number}: {error}") from error
+    if not queries:
+        raise ValueError(f"{path}: expected at least one row, got none")
     return queries
+
+
+def _responses(row: Any) -> list[Response]:
+    """The responses of one row; gold and tokens are not known yet."""
+    prompt, texts = (row.get("prompt"), row.get("responses")) if isinstance(row, dict) else (None, None)
+    if not isinstance(prompt, str) or not isinstance(texts, list) or not all(isinstance(t, str) for t in texts):
+        raise ValueError(f'expected {{"prompt": string, "responses": [strings]}}, got {row!r}')
+    return [Response(prompt, text) for text in texts]
 
 
 def _with_gold(responses: list[Response], task: Any) -> list[Response]:
@@ -68,6 +77,7 @@ def _with_gold(responses: list[Response], task: Any) -> list[Response]:
 
 def fit_reward(config: Config, source: Path, out: Path) -> Fitted:
     """Fit a reward model on a folder's store, or on a file of prompt/chosen/rejected lines, and save it."""
+    check_free(out)
     with tempfile.TemporaryDirectory() as scratch:
         from_file = source.is_file()
         with Store[Any](Path(scratch) if from_file else source, write=from_file) as store:
@@ -108,8 +118,13 @@ def shrink(config: Config) -> Config:
 
 
 def estimate(config: Config) -> float:
-    """Seconds that a run would take, about, from one small round in a temporary folder."""
-    small = shrink(config)
+    """Seconds that a run would take, about, from one small round of the true task in a temporary folder.
+
+    Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
+    """
+    true_size = {name: value for name, value in config.learner if name.startswith("evaluation_")}
+    small = shrink(config).model_copy(update={"task": config.task})
+    small = small.model_copy(update={"learner": small.learner.model_copy(update=true_size)})
     with tempfile.TemporaryDirectory() as scratch, Store[Any](Path(scratch)) as store:
         loop = small.build(store)
         start, one = (round.metrics for round in loop.run())
@@ -125,7 +140,9 @@ def estimate(config: Config) -> float:
 
 
 def _keep_config(config: Config, folder: Path) -> None:
-    """Write the settings beside a store that was made for the same task, or refuse."""
-    if (folder / "config.yaml").exists() and saved_config(folder).task != config.task:
+    """Write the settings beside a store, or see that it was made for the same task. The first ones stay."""
+    path = folder / "config.yaml"
+    if not path.exists():
+        write_file(path, config.dump().encode())
+    elif saved_config(folder).task != config.task:
         raise RunError(f"{folder} holds labels for another task: choose another folder")
-    write_file(folder / "config.yaml", config.dump().encode())

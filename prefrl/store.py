@@ -44,7 +44,7 @@ class _View:
             self.candidates[row.id] = row.body
         elif row.kind == "query":
             self.queries[row.id] = row.body["candidates"]
-        else:
+        elif row.kind in (*ANSWERS, "retract"):
             answer = _answer(row.kind, row.subject, row.actor, row.body) if row.kind in ANSWERS else None
             self.answers.append((row.seq, row.subject, row.actor, answer))
 
@@ -90,6 +90,7 @@ class Store(Generic[C]):
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
         candidates = {c.id: c for query in queries for c in query.candidates}
+        self._check_kind(candidates.values())
         self._file(candidates.values())
         rows = [row(id, "candidate", body=_describe(candidate)) for id, candidate in candidates.items()]
         rows += [row(query.id, "query", body={"candidates": [c.id for c in query.candidates]}) for query in queries]
@@ -123,23 +124,25 @@ class Store(Generic[C]):
 
         All or none: each is checked before anything is written. Raises `ValueError` naming the first bad event.
         """
-        known = dict(self._refresh().queries)
-        candidates: dict[str, C] = {}
+        known, candidates = dict(self._refresh().queries), dict[str, Any]()
         for number, one in enumerate(events, 1):
             try:
-                if one["kind"] == "candidate":
-                    candidates[one["id"]] = _load(one["id"], one["body"], blobs)
-                elif one["kind"] == "query":
-                    known[one["id"]] = _check_query(one["id"], one["body"], candidates)
-                elif one["subject"] not in known:
-                    raise StoreError(f"it speaks of query {one['subject'][:12]}, which is not there")
-                elif one["kind"] != "retract":
-                    _answer(one["kind"], one["subject"], one["actor"], one["body"])
+                _check_event(one, known, candidates, blobs)
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise ValueError(f"event {number} cannot be merged: {error}") from error
+        self._check_kind(candidates.values())
         self._file(candidates.values())
         self._log.append(events)
         return sum(one["kind"] in ANSWERS for one in events)
+
+    def _check_kind(self, candidates: Iterable[Candidate]) -> None:
+        """A store holds segments or responses, not both: a learner could make nothing of the others."""
+        there = next(iter(self._refresh().candidates.values()), None)
+        new = next(iter(candidates), None)
+        if there is not None and new is not None and there["type"] != _describe(new)["type"]:
+            raise StoreError(
+                f"the store in {self.folder} holds {there['type']}s, and cannot hold {type(new).__name__}s"
+            )
 
     def _answer_id(self, query: str, labeler: str) -> str:
         retracted = sum(a is None and (q, n) == (query, labeler) for _, q, n, a in self._view.answers)
@@ -232,6 +235,31 @@ def _load(id: str, body: dict[str, Any], blobs: Path) -> Any:
     if loaded.id != id:
         raise StoreError(f"candidate {id[:12]} has changed since it was filed: its sha256 is now {loaded.id[:12]}")
     return loaded
+
+
+def _check_event(one: dict[str, Any], queries: dict[str, list[str]], candidates: dict[str, Any], blobs: Path) -> None:
+    """Check an event from elsewhere against those before it, and remember it if later ones may speak of it."""
+    if not all(isinstance(one[name], str) for name in ("id", "kind", "subject", "actor", "at")):
+        raise TypeError("id, kind, subject, actor and at must be strings")
+    if one["kind"] == "candidate":
+        candidates[one["id"]] = _load(one["id"], one["body"], blobs)
+    elif one["kind"] == "query":
+        queries[one["id"]] = _check_query(one["id"], one["body"], candidates)
+    elif one["subject"] not in queries:
+        raise StoreError(f"it speaks of query {one['subject'][:12]}, which is not there")
+    elif not one["id"].startswith(f"{one['subject']}:{one['actor']}:"):
+        raise StoreError(f"its id {one['id'][:20]} is not that of an answer to its query by its labeler")
+    elif one["kind"] in ANSWERS:
+        _check_size(_answer(one["kind"], one["subject"], one["actor"], one["body"]), len(queries[one["subject"]]))
+    elif one["kind"] != "retract":
+        raise StoreError(f"unknown kind {one['kind']!r}")
+
+
+def _check_size(answer: Answer, size: int) -> None:
+    """A comparison judges two candidates, a ranking each one of its query's."""
+    judged = {Comparison: 2, Ranking: len(getattr(answer, "ranks", ())), Skip: size}[type(answer)]
+    if judged != size:
+        raise StoreError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
 
 
 def _check_query(id: str, body: dict[str, Any], candidates: dict[str, Any]) -> list[str]:

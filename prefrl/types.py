@@ -278,6 +278,8 @@ class Round(Generic[C]):
     examples: tuple[C, ...] = field(default=(), repr=False)
     fitted: Fitted | None = field(default=None, repr=False)
     """This round's fit; None in round 0 and where there was nothing to fit on."""
+    notes: tuple[str, ...] = ()
+    """What did not go as asked, for people."""
 
 
 def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:

@@ -88,11 +88,12 @@ class MLPReward:
         self._fitted = True
 
     @torch.no_grad()
+    def raw_member_scores(self, candidates: Sequence[Segment]) -> Floats:
+        return (_sums(self._in_chunks(_steps(candidates)), candidates) * self._scale_of_sums).numpy()
+
+    @torch.no_grad()
     def member_scores(self, candidates: Sequence[Segment]) -> Floats:
-        lengths = [len(c) for c in candidates]
-        inputs = torch.cat([_inputs(c.observations, c.actions) for c in candidates])
-        parts = torch.split(self._member_rewards(inputs), lengths, 1)
-        return torch.stack([part.sum(1) for part in parts], 1).numpy()
+        return _sums(self._member_rewards(_steps(candidates)), candidates).numpy()
 
     def score(self, candidates: Sequence[Segment]) -> Floats:
         mean: Floats = self.member_scores(candidates).mean(0)
@@ -131,9 +132,11 @@ class MLPReward:
             x = self._activation(torch.baddbmm(bias, x, weight))
         return torch.baddbmm(self._biases[-1], x, self._weights[-1])[:, :, 0]
 
+    def _in_chunks(self, inputs: Tensor) -> Tensor:
+        return torch.cat([self._outputs(chunk) for chunk in torch.split(inputs, CHUNK)], 1)
+
     def _member_rewards(self, inputs: Tensor) -> Tensor:
-        outputs = torch.cat([self._outputs(chunk) for chunk in torch.split(inputs, CHUNK)], 1)
-        return (outputs - self._shift[:, None]) / self._scale[:, None]
+        return (self._in_chunks(inputs) - self._shift[:, None]) / self._scale[:, None]
 
     @torch.no_grad()
     def _rebase(self, inputs: Tensor) -> None:
@@ -155,6 +158,17 @@ def _padded(candidates: Sequence[Segment]) -> dict[str, Tensor]:
         inputs[i, : len(candidate)] = _inputs(candidate.observations, candidate.actions)
         mask[i, : len(candidate)] = 1.0
     return {"inputs": inputs, "mask": mask}
+
+
+def _steps(candidates: Sequence[Segment]) -> Tensor:
+    """(B, O + A): the steps of all candidates, one after another."""
+    return torch.cat([_inputs(c.observations, c.actions) for c in candidates])
+
+
+def _sums(steps: Tensor, candidates: Sequence[Segment]) -> Tensor:
+    """(E, B) values of the steps of N candidates -> (E, N) sums."""
+    parts = torch.split(steps, [len(c) for c in candidates], 1)
+    return torch.stack([part.sum(1) for part in parts], 1)
 
 
 def _inputs(observations: Floats, actions: Floats) -> Tensor:

@@ -86,10 +86,14 @@ class TransformerReward:
         self._fitted = True
 
     @torch.no_grad()
-    def member_scores(self, candidates: Sequence[Response]) -> Floats:
+    def raw_member_scores(self, candidates: Sequence[Response]) -> Floats:
         features = self._in_chunks([_ids(c, self._tokenizer) for c in candidates])
-        raw = self.scores({"features": features})
-        found: Floats = ((raw - self._shift[:, None]) / self._scale[:, None]).numpy()
+        raw: Floats = self.scores({"features": features}).numpy()
+        return raw
+
+    def member_scores(self, candidates: Sequence[Response]) -> Floats:
+        shift, scale = self._shift.numpy()[:, None], self._scale.numpy()[:, None]
+        found: Floats = (self.raw_member_scores(candidates) - shift) / scale
         return found
 
     def score(self, candidates: Sequence[Response]) -> Floats:

@@ -75,7 +75,7 @@ def test_candidates_of_ones_own_can_be_labelled(prefrl: Shell) -> None:
     assert " terrible ." not in best
     Path("given.jsonl").write_text('{"prompt": "p"}')
     assert prefrl("label text/toy --given given.jsonl --out other") == 2
-    assert "row 1: expected a prompt and its responses" in prefrl.err
+    assert "row 1: expected" in prefrl.err
 
 
 def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
@@ -175,3 +175,53 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert child.returncode == 130
     assert "prefrl resume run" in rest.replace("\n", " ")
     assert "Traceback" not in errors
+
+
+def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
+    assert prefrl("run control/toy --out run task.segment_steps=41") == 2
+    assert prefrl("run control/toy --out run loop.rounds=1") == 0
+
+
+def test_a_run_that_never_learns_anything_says_so(prefrl: Shell) -> None:
+    assert prefrl("run control/toy --out run labeler.tie_within=1e6") == 2
+    assert "nothing to fit: all 60 comparisons are ties" in prefrl.out
+    assert "nothing was learned" in prefrl.err
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ('{"prompt": "p", "responses": "bad"}', "row 1: expected"),
+        ('{"prompt": "p", "responses": ["a"]}', "row 1: a query needs at least 2"),
+        ("", "at least one row"),
+    ],
+)
+def test_given_candidates_are_checked(prefrl: Shell, row: str, message: str) -> None:
+    Path("given.jsonl").write_text(row)
+    assert prefrl("label text/toy --given given.jsonl --out labels") == 2
+    assert message in prefrl.err
+    assert prefrl("label control/toy --given given.jsonl --out other") == 2
+    assert "is no text task" in prefrl.err
+
+
+def test_asking_for_more_labels_asks_for_the_rest(prefrl: Shell) -> None:
+    assert prefrl("label control/toy --out labels loop.labels=5") == 0
+    assert prefrl("label control/toy --out labels loop.labels=12") == 0
+    assert "12 of 12 queries answered" in prefrl.out
+
+
+@pytest.mark.parametrize("line", ["run control/toy --out file", "export labels --to out.jsonl"])
+def test_what_the_disk_does_not_allow_is_a_line_and_no_traceback(prefrl: Shell, line: str) -> None:
+    assert prefrl("label control/toy --out labels loop.labels=2") == 0
+    Path("file").write_text("x")
+    Path("out.jsonl").mkdir()
+    assert prefrl(line) == 2
+    assert prefrl.err.startswith("error: ")
+
+
+def test_the_installed_command_turns_a_mistake_into_status_two(tmp_path: Path) -> None:
+    script = Path(sys.executable).parent / "prefrl"
+    done = subprocess.run([script, "run", "nothing"], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "no such preset" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -21,7 +21,7 @@ def test_a_dumped_config_spells_out_every_default(tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(Config.load(TOY).dump())
     data = yaml.safe_load(path.read_text())
-    assert data["labeler"] == {"kind": "oracle", "error_rate": 0.0, "tie_within": 0.0}
+    assert data["labeler"] == {"kind": "oracle", "mistake_rate": 0.0, "tie_within": 0.0}
     assert Config.load(path) == Config.load(TOY)
 
 
@@ -37,6 +37,11 @@ def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:
         seed=3,
     )
     assert by_override == by_hand
+
+
+def test_the_order_of_overrides_does_not_matter() -> None:
+    words = ["select.candidates=3", "select.kind=disagreement"]
+    assert Config.load(TOY, words) == Config.load(TOY, words[::-1])
 
 
 def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:

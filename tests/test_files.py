@@ -1,8 +1,9 @@
+import os
 from pathlib import Path
 
 import pytest
 
-from prefrl.files import DamagedError, verify, whole_folder, write_file
+from prefrl.files import DamagedError, read_lines, verify, whole_folder, write_file
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -46,3 +47,44 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def fill(path: Path, text: bytes) -> None:
+    with whole_folder(path) as work:
+        write_file(work / "a", text)
+
+
+def test_a_folder_of_ours_is_replaced_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
+    fill(tmp_path / "c", b"1")
+    fill(tmp_path / "c", b"2")
+    assert (tmp_path / "c/a").read_bytes() == b"2"
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_folder_with_anything_else_in_it_is_never_removed(tmp_path: Path, begun: bool) -> None:
+    if begun:
+        fill(tmp_path / "c", b"1")
+    (tmp_path / "c").mkdir(exist_ok=True)
+    (tmp_path / "c/letter.txt").write_text("dear")
+    with pytest.raises(ValueError, match=r"letter\.txt"):
+        fill(tmp_path / "c", b"2")
+    assert (tmp_path / "c/letter.txt").read_text() == "dear"
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ValueError, match="is a file"):
+        fill(tmp_path / "file", b"2")
+
+
+def test_files_have_the_mode_that_the_user_wishes(tmp_path: Path) -> None:
+    old = os.umask(0o077)
+    try:
+        fill(tmp_path / "c", b"1")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "c").stat().st_mode & 0o777 == 0o700
+    assert (tmp_path / "c/a").stat().st_mode & 0o777 == 0o600
+
+
+def test_lines_are_cut_at_line_feeds_alone(tmp_path: Path) -> None:
+    (tmp_path / "f").write_bytes("\ufeffa\u2028b\u0085c\r\nd\n".encode())
+    assert list(read_lines(tmp_path / "f")) == ["a\u2028b\u0085c", "d"]

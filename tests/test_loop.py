@@ -169,6 +169,7 @@ def test_without_any_label_the_loop_goes_on_and_learns_nothing(tmp_path: Path) -
     loop.labeler = Silent()
     rounds = list(loop.run())
     assert rounds[-1].fitted is None
+    assert "no judgements" in rounds[-1].notes[0]
     assert not any(name.startswith("improve/") for name in rounds[-1].metrics)
     assert list(leaves(loop.reward.state())) == before
     assert loop.learner.steps.learn == 0
@@ -181,16 +182,22 @@ class Silent:
         """People are at lunch."""
 
 
-def test_a_pool_that_is_too_small_says_what_to_change(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [1, 8])
+def test_a_pool_that_is_too_small_is_noted_and_none_at_all_says_what_to_change(size: int, tmp_path: Path) -> None:
     loop = build("control/toy", tmp_path)
 
     class Lazy(Blind):
         def sample(self, count: int, rng: np.random.Generator) -> list[Any]:
-            return list(self._learner.sample(count, rng)[:4])
+            return list(self._learner.sample(count, rng)[:size])
 
     loop.learner = Lazy(loop.learner)
-    with pytest.raises(ValueError, match=r"raise loop\.pool"):
-        list(loop.run())
+    if size == 1:
+        with pytest.raises(ValueError, match=r"raise loop\.pool"):
+            list(loop.run())
+        return
+    _, first, *_ = loop.run()
+    assert "8 sampled candidates gave" in first.notes[0]
+    assert 0 < first.metrics["label/asked"] <= 4
 
 
 def test_labels_are_spread_as_the_settings_say() -> None:

@@ -3,14 +3,18 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from prefrl import Config
 from prefrl.checkpoints import load_state
+from prefrl.components import ConfigError
 from prefrl.rundir import Run, RunError, open_saved
+from prefrl.stages import label, with_reward
 from prefrl.store import Store
 
 TOYS = ["control/toy", "text/toy"]
@@ -68,28 +72,73 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(name: str, tmp_path
     assert numbers(tmp_path / "parts") == numbers(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("name", TOYS)
-def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(name: str, tmp_path: Path) -> None:
-    finish(name, tmp_path / "whole")
-    code = (
-        "import sys, torch; torch.set_num_threads(1); from prefrl import Config; from prefrl.rundir import Run\n"
-        "with Run(Config.load(sys.argv[1]), sys.argv[2]) as run:\n"
-        "    for r in run: print(r.number, flush=True)"
-    )
-    for wait in (0.3, 0.7):  # after the first line: in the middle of a round, wherever that is
-        child = subprocess.Popen(
-            [sys.executable, "-c", code, name, str(tmp_path / "killed")], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        )
-        with child:
-            assert child.stdout is not None
-            child.stdout.readline()
-            time.sleep(wait)
-            child.send_signal(signal.SIGKILL)
+DYING = """
+import os, signal, sys, torch
+from prefrl import Config, Run
+from prefrl.store import Store
+
+torch.set_num_threads(1)
+name, folder, moment = sys.argv[1:]
+calls = [0]
+
+def dying(method, last, after):
+    def wrapped(*arguments):
+        calls[0] += 1
+        if calls[0] == last and not after:
+            os.kill(os.getpid(), signal.SIGKILL)
+        method(*arguments)
+        if calls[0] == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return wrapped
+
+place, word, last, after = {
+    "amid the blobs": (Store, "_file_one", 30, True),
+    "asked": (Store, "ask", 2, True),
+    "answered": (Store, "answer", 2, True),
+    "improved": (Run, "_record", 3, False),
+    "before the checkpoint": (Run, "_checkpoint", 3, False),
+}[moment]
+setattr(place, word, dying(getattr(place, word), last, after))
+with Run(Config.load(name), folder) as run:
+    list(run)
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A run that nobody disturbed."""
+
+    @cache
+    def make(name: str) -> Path:
+        folder = tmp_path_factory.mktemp("whole") / "run"
+        finish(name, folder)
+        return folder
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("name", "moment"),
+    [
+        ("control/toy", "amid the blobs"),
+        ("control/toy", "asked"),
+        ("control/toy", "answered"),
+        ("control/toy", "improved"),
+        ("control/toy", "before the checkpoint"),
+        ("text/toy", "answered"),
+        ("text/toy", "before the checkpoint"),
+    ],
+)
+def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(
+    name: str, moment: str, whole: Callable[[str], Path], tmp_path: Path
+) -> None:
+    child = subprocess.run([sys.executable, "-c", DYING, name, str(tmp_path / "killed"), moment], check=False)
+    assert child.returncode == -signal.SIGKILL
     finish(name, tmp_path / "killed")
-    assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
-    assert numbers(tmp_path / "killed") == numbers(tmp_path / "whole")
-    with Store(tmp_path / "killed", write=False) as killed, Store(tmp_path / "whole", write=False) as whole:
-        assert killed.answers() == whole.answers()
+    assert weights(tmp_path / "killed") == weights(whole(name))
+    assert numbers(tmp_path / "killed") == numbers(whole(name))
+    with Store[Any](tmp_path / "killed", write=False) as a, Store[Any](whole(name), write=False) as b:
+        assert a.answers() == b.answers()
 
 
 def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
@@ -140,3 +189,51 @@ def test_a_checkpoint_holds_all_that_is_needed_to_use_it(tmp_path: Path) -> None
     saved = open_saved(tmp_path / "alone")
     assert saved.config == Config.load("control/toy")
     assert load_state(saved.folder, "learner")["steps"][0] > 0
+
+
+def test_a_start_that_failed_does_not_block_the_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        Run(Config.load("control/toy", ["task.segment_steps=41"]), tmp_path / "run")
+    with Run(Config.load("control/toy"), tmp_path / "run") as run:
+        next(iter(run))
+
+
+def test_labels_are_not_added_to_the_folder_of_a_run(tmp_path: Path) -> None:
+    finish("control/toy", tmp_path / "run")
+    before = (tmp_path / "run/config.yaml").read_bytes()
+    with pytest.raises(RunError, match="asks for its own labels"):
+        label(Config.load("control/toy", ["loop.labels=7"]), tmp_path / "run")
+    assert (tmp_path / "run/config.yaml").read_bytes() == before
+
+
+def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(tmp_path: Path) -> None:
+    finish("control/toy", tmp_path / "a")
+    finish("control/toy", tmp_path / "b", "seed=1")
+    config = with_reward(Config.load("control/toy", ["loop.rounds=1"]), tmp_path / "a")
+    Run(config, tmp_path / "policy", tmp_path / "a").close()  # stopped before anything was done
+    with Run.resume(tmp_path / "policy") as run:
+        assert run.loop.reward.fitted
+        *_, last = run
+    assert last.metrics["steps/learn"] > 0
+    with pytest.raises(RunError, match="another reward model"):
+        Run(config, tmp_path / "policy", tmp_path / "b")
+    other = with_reward(Config.load("control/toy", ["task.horizon=30"]), tmp_path / "a")
+    with pytest.raises(RunError, match=r"another task \(task\.horizon is 40 there, 30 here\)"):
+        Run(other, tmp_path / "other", tmp_path / "a")
+
+
+@pytest.mark.parametrize("name", ["what?", "100%", "a#b", "ü n", "[red]x"])
+def test_a_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
+    with Run(Config.load("control/toy", ["loop.rounds=1"]), tmp_path / name) as run:
+        list(run)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    with Store(tmp_path / name, write=False) as store:
+        assert store.counts()["answered"] == 120
+
+
+def test_the_newest_checkpoint_is_the_one_with_the_highest_number(tmp_path: Path) -> None:
+    finish("control/toy", tmp_path / "run")
+    folder = tmp_path / "run/checkpoints"
+    (folder / "round-0003").rename(folder / "round-9999")
+    (folder / "round-0004").rename(folder / "round-10000")
+    assert open_saved(tmp_path / "run").folder.name == "round-10000"

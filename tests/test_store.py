@@ -191,3 +191,9 @@ def test_a_full_disk_is_an_error_and_loses_nothing(store: Store[Segment], make_q
     with pytest.raises(DatabaseError, match="full"):
         store.ask([make_query() for _ in range(200)])
     assert [q.id for q in store.open_queries()] == [kept.id]
+
+
+def test_of_two_answers_given_at_once_the_first_stands(store: Store[Segment], make_query: Ask) -> None:
+    store.ask([query := make_query()])
+    store.answer([Comparison(query.id, 1.0, "me"), Comparison(query.id, 0.0, "me")])
+    assert store.judged()[0].judgement == Comparison(query.id, 1.0, "me")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic
@@ -87,7 +88,8 @@ def split(data: Batch[C], judged: list[Judged[C]], share: float) -> np.ndarray:
     """(M,) bool: which comparisons are held out. Those that share a candidate, also by way of others, stay together.
 
     The choice hangs on the id of a component's oldest query alone: it stays the same when judgements are added, so
-    what was held out once is not trained on later. Nothing is held out where that would leave nothing to train on.
+    what was held out once is not trained on later, unless a new judgement joins two components of which the older one
+    is trained on. Nothing is held out where that would leave nothing to train on.
     """
     links = coo_array((np.ones(len(data)), (data.edges[:, 0], data.edges[:, 1])), shape=(len(data.candidates),) * 2)
     _, component = connected_components(links, directed=False)
@@ -184,7 +186,7 @@ def predict(scores: Tensor, data: Batch[C]) -> Floats:
 def _measure(scores: Tensor, data: Batch[C], error_rate: float, suffix: str) -> Metrics:
     """Loss, accuracy and calibration of the ensemble's mean prediction."""
     logits, preference = preference_logits(scores, torch.as_tensor(data.edges)), torch.as_tensor(data.preference)
-    first, second = (log_preference(sign * logits, error_rate).exp().mean(0).log() for sign in (1, -1))
+    first, second = (log_preference(sign * logits, error_rate).logsumexp(0) - math.log(len(logits)) for sign in (1, -1))
     loss = -(preference * first + (1 - preference) * second)
     predicted = predict(scores, data)
     values = {

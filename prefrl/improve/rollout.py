@@ -17,7 +17,9 @@ Act: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
 """(n, O) observations -> (n, A) what the policy chose, and (n, A) what the environment is to execute."""
 EXAMPLES, EXAMPLE_SECONDS = 3, 4.0
 OVERLAP = 4
-"""How many segments of a first pool may share a step: an episode is not to be spent on every few segments."""
+"""How many segments of a first pool share a step, on average: an episode is not to be spent on every few segments."""
+PATIENCE = 4
+"""A first pool is given up after this many times the steps of as many segments that share none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,15 +149,42 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
 
 
 def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.random.Generator) -> Rollout:
-    """What a starting policy does: whole episodes that hold `count` windows, in at most `most` environments."""
-    wanted = math.ceil(count * task.segment_steps / (OVERLAP * task.horizon))
-    envs, parts = task.environments(min(max(wanted, 1), most)), list[Rollout]()
-    observations = envs.reset(rng)
-    while True:
+    """What a starting policy does: `count` windows in count * segment_steps / OVERLAP steps, or in more.
+
+    It takes `horizon` steps at a time in each of at most `most` environments. Raises ValueError where episodes end too
+    early to hold that many windows.
+    """
+    episodes = max(1, math.ceil(count * task.segment_steps / (OVERLAP * task.horizon)))
+    passes = math.ceil(episodes / most)
+    n = math.ceil(episodes / passes)
+    envs, parts, held, longest = task.environments(n), list[Rollout](), 0, 0
+    observations, age = envs.reset(rng), np.zeros(n, np.int64)
+    while len(parts) < passes or held < count:
+        if len(parts) >= PATIENCE * OVERLAP * passes:
+            raise ValueError(_too_short(task, sum(p.ends.size for p in parts), held, count, longest))
         rollout, observations = collect(envs, observations, task.horizon, act)
         parts.append(rollout)
-        if len(windows(joined(parts), task.segment_steps)[0]) >= count:
-            return joined(parts)
+        ages = _ages(rollout.ends, age)
+        held += int((ages >= task.segment_steps).sum())  # so many windows end here
+        age, longest = np.where(rollout.ends[:, -1], 0, ages[:, -1]), max(longest, int(ages.max()))
+    return joined(parts)
+
+
+def _ages(ends: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(n, T): which step of its episode each is, from 1, where `before` (n,) steps came earlier."""
+    at = np.arange(ends.shape[1])
+    begins = np.where(np.roll(ends, 1, 1), at, -before[:, None])
+    begins[:, 0] = -before
+    ages: np.ndarray = at + 1 - np.maximum.accumulate(begins, 1)
+    return ages
+
+
+def _too_short(task: ControlTask, steps: int, held: int, count: int, longest: int) -> str:
+    return (
+        f"{steps} steps of the starting policy hold {held} segments of {task.segment_steps} steps within one episode, "
+        f"but {count} were asked for; the longest episode seen had {longest} steps: make task.segment_seconds (or "
+        "segment_steps) smaller, or leave task.variable_horizon at false, so that episodes do not end early"
+    )
 
 
 def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Generator) -> Rollout:

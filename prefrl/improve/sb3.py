@@ -36,6 +36,8 @@ from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 ALGORITHMS = {"PPO": PPO, "SAC": SAC}
 PPO_STEPS = 2048
 """stable-baselines3's default `n_steps`."""
+BATCH = 64
+"""The default `batch_size` of its PPO."""
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -55,6 +57,30 @@ class SB3Settings(Settings):
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, without exploration, in environments of their own."""
+
+    def shrunk(self) -> SB3Settings:
+        """One rollout of a batch in each environment for PPO; for SAC about as many steps, learning from the first."""
+        if self.steps_per_round % (self.at_once * self.environments):
+            return self  # building it says what is wrong
+        options: dict[str, Any] = dict(self.options)
+        if self.algorithm == "PPO":
+            options["n_steps"] = each = min(self.at_once, options.get("batch_size", BATCH))
+        else:
+            options["learning_starts"] = 0
+            each = min(self.steps_per_round // self.environments, self.at_once * max(1, BATCH // self.at_once))
+        steps = each * self.environments
+        return self.model_copy(update={"options": options, "steps_per_round": steps, "evaluation_episodes": 1})
+
+    def work(self) -> float:
+        return float(self.steps_per_round)
+
+    @property
+    def at_once(self) -> int:
+        """Steps that the algorithm collects in each environment between two updates."""
+        options: dict[str, Any] = self.options
+        if self.algorithm == "PPO":
+            return int(options.get("n_steps", min(PPO_STEPS, max(self.steps_per_round // self.environments, 1))))
+        return int(options.get("train_freq", 1))
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
@@ -82,7 +108,7 @@ class SB3:
         self._learned = LearnedReward(self._env, None)
         with seeded(rng):
             self.model = _algorithm(settings, self._learned)
-        _check_steps(settings, self.model)
+        _check_steps(settings)
         self._steps, self._rounds = Steps(), 0
         self._recent: Rollout | None = None
 
@@ -175,9 +201,8 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
 
 def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
     options = dict(settings.options)
-    each = settings.steps_per_round // settings.environments
     if settings.algorithm == "PPO":
-        options.setdefault("n_steps", min(PPO_STEPS, max(each, 1)))
+        options.setdefault("n_steps", settings.at_once)
     try:
         return ALGORITHMS[settings.algorithm](
             "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device="cpu", verbose=0, **options
@@ -186,10 +211,10 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
         raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error
 
 
-def _check_steps(settings: SB3Settings, model: Any) -> None:
+def _check_steps(settings: SB3Settings) -> None:
     """The algorithms overshoot a budget that is no multiple of what they collect at once."""
-    at_once = model.n_steps if settings.algorithm == "PPO" else model.train_freq.frequency
-    unit = int(at_once) * settings.environments
+    at_once = settings.at_once
+    unit = at_once * settings.environments
     if settings.steps_per_round % unit:
         raise ConfigError(
             f"learner.steps_per_round must be a multiple of {unit} ({settings.algorithm} collects {at_once} steps in "

@@ -211,7 +211,8 @@ class TextLearner:
         kl = torch.where(batch.mask, kl_k1(batch.logp, reference), 0.0)
         in_reward = self._kl.beta if self._settings.kl_in == "reward" else 0.0
         returns = step_rewards(scores, kl, batch.mask, in_reward).sum(1)
-        advantages = advantages_of(returns.view(-1, self._settings.responses), self._settings.advantage)
+        groups = returns.view(-1, self._settings.responses)
+        advantages = advantages_of(groups, self._settings.advantage)
         learned = self._learn(batch, advantages.flatten(), reference, rng)
         sequence_kl = float(kl.sum(1).mean())
         if self._settings.kl_target is not None:
@@ -225,6 +226,7 @@ class TextLearner:
             "length": float(lengths.mean()),
             "ended": float(batch.ended.float().mean()),
             "beta": self._kl.beta,
+            "equal_groups": float((groups == groups[:, :1]).all(1).float().mean()),
         }
 
     def _reference_logp(self, batch: Responses) -> Tensor:

@@ -86,7 +86,7 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
 class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
     """Any `VecEnv` with a reward model's rewards in place of its own, which are dropped.
 
-    Put it inside of whatever normalises observations: a reward model sees them raw. Swap `reward` after a fit; with
+    Put it inside of whatever normalises observations: a reward model sees them raw. Swap `learned` after a fit; with
     a replay buffer, `relabel` it too. Raises FloatingPointError where a reward is not finite.
     """
 

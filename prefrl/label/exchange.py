@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
 from collections import Counter
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from prefrl.files import verify, whole_folder, write_file
+from prefrl.files import read_lines, verify, whole_folder, write_file
 from prefrl.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response, implied_pairs
@@ -42,9 +43,8 @@ def export_preferences(store: Store[Any], path: Path) -> Exported:
             if preference != 0.5:
                 better, worse = (texts[i], texts[j]) if preference > 0.5 else (texts[j], texts[i])
                 row = dict(zip(COLUMNS, (texts[0].prompt, better.text, worse.text), strict=True))
-                lines.append(json.dumps(row, ensure_ascii=False) + "\n")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(lines), encoding="utf-8")
+                lines.append(_line(row))
+    write_file(path, "".join(lines).encode())
     return Exported(len(lines), ties)
 
 
@@ -52,8 +52,9 @@ def import_preferences(path: Path, store: Store[Response]) -> int:
     """Read `prompt`, `chosen`, `rejected` rows into a store, all or none; returns the number of rows.
 
     JSON lines, or a table that `datasets` reads: .csv or .parquet.
-    Raises `ValueError` with the number of each bad row (the first 20). A pair that comes again is another judgement
-    of the same query, by "file#2" and so on: contradictions are kept, not resolved.
+    Raises `ValueError` with the number of each bad row (the first 20). A pair that comes again, in this
+    file or in another, is another judgement of the same query: contradictions are kept, not resolved. The labeler is
+    named after the file's content, so reading the same file twice changes nothing.
     """
     rows, errors = [], []
     for number, row in enumerate(_rows(path), 1):
@@ -68,19 +69,30 @@ def import_preferences(path: Path, store: Store[Response]) -> int:
         raise ValueError(f"{path}: expected at least one row of {', '.join(COLUMNS)}, got none")
     seen: Counter[str] = Counter()
     answers = []
+    source = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     for query, chosen in rows:
         seen[query.id] += 1
-        labeler = "file" if seen[query.id] == 1 else f"file#{seen[query.id]}"
+        labeler = f"file:{source}" + (f"#{seen[query.id]}" if seen[query.id] > 1 else "")
         answers.append(Comparison(query.id, float(query.candidates[0].id == chosen), labeler))
     store.ask([query for query, _ in rows])
     store.answer(answers)
     return len(rows)
 
 
+def _line(row: dict[str, Any]) -> str:
+    """One line of JSON, readable in any language; escaped where the text is no valid Unicode."""
+    line = json.dumps(row, ensure_ascii=False)
+    try:
+        line.encode()
+    except UnicodeEncodeError:
+        line = json.dumps(row)
+    return line + "\n"
+
+
 def _rows(path: Path) -> Iterator[Any]:
     """Lines of JSON, or the rows of a table as dicts."""
     if path.suffix not in (".csv", ".parquet"):
-        yield from path.read_text(encoding="utf-8-sig").splitlines()
+        yield from read_lines(path)
         return
     from datasets import Dataset
 
@@ -112,7 +124,7 @@ def export_bundle(store: Store[Any], path: Path) -> Exported:
     """Write a folder with every event and every array, gold apart from the rest and left out. Loses nothing else."""
     events = list(store.events())
     with whole_folder(path) as work:
-        lines = "".join(json.dumps(event, ensure_ascii=False) + "\n" for event in events)
+        lines = "".join(_line(event) for event in events)
         write_file(work / "events.jsonl", lines.encode())
         for blob in sorted((store.folder / "blobs").rglob("*.safetensors")):
             write_file(work / blob.relative_to(store.folder), blob.read_bytes())
@@ -126,7 +138,7 @@ def import_bundle(path: Path, store: Store[Any]) -> int:
 
 
 def _events(path: Path) -> Iterator[dict[str, Any]]:
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(read_lines(path), 1):
         try:
             event = json.loads(line)
             yield {name: event[name] for name in ("id", "kind", "subject", "actor", "body", "at")}

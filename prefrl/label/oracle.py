@@ -19,7 +19,7 @@ class OracleSettings(Settings):
     """Prefer the candidate with the higher gold."""
 
     kind: Literal["oracle"] = "oracle"
-    error_rate: float = Field(0.0, ge=0, le=1)
+    mistake_rate: float = Field(0.0, ge=0, le=1)
     """The probability that a judgement is turned upside down (B-Pref's mistake teacher)."""
     tie_within: float = Field(0.0, ge=0)
     """Gold scores that differ by no more than this are judged equal."""
@@ -48,7 +48,7 @@ class Oracle:
             raise ValueError(
                 f"the oracle needs finite gold, got {scores} for query {query.id[:12]}; use another labeler"
             )
-        if rng.random() < self.settings.error_rate:
+        if rng.random() < self.settings.mistake_rate:
             scores = -scores
         shown = tuple(int(i) for i in rng.permutation(len(scores)))
         ranks = _ranks(scores, self.settings.tie_within)

@@ -13,23 +13,44 @@ from pydantic import Field
 
 from prefrl.components import Settings
 from prefrl.protocols import RewardModel
-from prefrl.types import C, Floats, Query
+from prefrl.types import C, Candidate, Floats, Query, Segment
+
+
+def overlap(a: Candidate, b: Candidate) -> bool:
+    """Whether two segments share steps of one episode; responses never do."""
+    if not (isinstance(a, Segment) and isinstance(b, Segment)) or a.episode != b.episode:
+        return False
+    return a.start < b.start + len(b) and b.start < a.start + len(a)
 
 
 def groups(pool: Sequence[C], size: int, rng: np.random.Generator) -> list[Query[C]]:
     """Disjoint random queries of `size` candidates of one context each, in random order.
 
-    A candidate stands in at most one query, so that no query repeats or half-repeats another.
+    A candidate stands in at most one query, so that no query repeats or half-repeats another, and never beside one
+    that it overlaps: what they share says nothing. Candidates left without enough others are dropped.
     """
     by_context: dict[str, list[C]] = defaultdict(list)
     for candidate in {c.id: c for c in pool}.values():
         by_context[candidate.context].append(candidate)
-    found = []
+    found: list[Query[C]] = []
     for members in by_context.values():
-        order = rng.permutation(len(members))
-        for start in range(0, len(members) - size + 1, size):
-            found.append(Query(tuple(members[i] for i in order[start : start + size])))
+        found += _first_fit([members[i] for i in rng.permutation(len(members))], size)
     return [found[i] for i in rng.permutation(len(found))]
+
+
+def _first_fit(members: Sequence[C], size: int) -> list[Query[C]]:
+    """Each candidate joins the first open group without one that it overlaps, else it opens a group."""
+    found: list[Query[C]] = []
+    opened: list[list[C]] = []  # few: whoever opened the newest overlaps a member of each
+    for candidate in members:
+        fits = (i for i, group in enumerate(opened) if not any(overlap(candidate, other) for other in group))
+        at = next(fits, len(opened))
+        if at == len(opened):
+            opened.append([])
+        opened[at].append(candidate)
+        if len(opened[at]) == size:
+            found.append(Query(tuple(opened.pop(at))))
+    return found
 
 
 class UniformSettings(Settings):
@@ -78,13 +99,16 @@ class Disagreement(Generic[C]):
         if not reward.fitted or reward.members < 2 or len(queries) <= count:
             return queries[:count]
         flat = [candidate for query in queries for candidate in query.candidates]
-        scores = reward.member_scores(flat).reshape(reward.members, len(queries), self.settings.candidates)
+        scores = reward.raw_member_scores(flat).reshape(reward.members, len(queries), self.settings.candidates)
         best = np.argsort(-disagreement(scores), kind="stable")[:count]
         return [queries[i] for i in best]
 
 
 def disagreement(scores: Floats) -> Floats:
-    """(E, Q, K) scores -> (Q,): the members' std of the preference probability, averaged over pairs of candidates."""
+    """(E, Q, K) raw scores -> (Q,): the members' std of the preference probability, averaged over candidate pairs.
+
+    Raw scores are the logits of the fitted likelihood; settled ones are on another scale, and would saturate.
+    """
     pairs = combinations(range(scores.shape[2]), 2)
     spread = [(0.5 + 0.5 * np.tanh((scores[:, :, i] - scores[:, :, j]) / 2)).std(0) for i, j in pairs]
     mean: Floats = np.mean(spread, axis=0)

@@ -165,3 +165,29 @@ def test_an_ensemble_fits_each_member_as_it_would_be_fitted_alone(judged: list[J
         assert pairs[-1][0].numel() == 1
         for mine, theirs in pairs[:-1]:  # the last bias is a shift of all scores: its gradient is rounding alone
             torch.testing.assert_close(mine, theirs[member : member + 1], rtol=1e-4, atol=1e-5)
+
+
+def test_a_confident_prediction_that_is_right_has_a_finite_loss(judged: list[Judged[Segment]]) -> None:
+    class Sure:
+        """Scores a hundred nats apart, in the right order."""
+
+        members, fitted = 2, True
+
+        def __init__(self) -> None:
+            self._shift = torch.nn.Parameter(torch.zeros(1))
+
+        def stack(self, candidates: Any) -> dict[str, torch.Tensor]:
+            return {"x": torch.tensor([planted(c) for c in candidates], dtype=torch.float32)}
+
+        def scores(self, stacked: dict[str, torch.Tensor]) -> torch.Tensor:
+            return (1e4 * stacked["x"] + self._shift).expand(2, -1)
+
+        def parameters(self) -> list[torch.nn.Parameter]:
+            return [self._shift]
+
+        def settle(self, stacked: Any) -> None:
+            """Nothing to settle."""
+
+    reward: Any = Sure()
+    fitted = fit_judged(reward, judged, FittingSettings(epochs=1), np.random.default_rng(0))
+    assert fitted.metrics["loss"] == fitted.metrics["loss_held_out"] == pytest.approx(0, abs=1e-6)

@@ -74,6 +74,9 @@ class Known:
 
     def settle(self, stacked: Mapping[str, torch.Tensor]) -> None: ...
 
+    def raw_member_scores(self, candidates: Sequence[Segment]) -> Floats:
+        return self.member_scores(candidates)
+
     def member_scores(self, candidates: Sequence[Segment]) -> Floats:
         return np.stack([[self.rewards(c.observations, c.actions).sum() for c in candidates]])
 

@@ -4,13 +4,28 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from prefrl import Config
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.rollout import Rollout, collect, cut, evaluation, first_rollout, joined, whole_episodes, windows
+from prefrl.improve.rollout import (
+    OVERLAP,
+    Act,
+    Rollout,
+    _ages,
+    collect,
+    cut,
+    evaluation,
+    first_rollout,
+    joined,
+    whole_episodes,
+    windows,
+)
 from prefrl.reward_models.mlp import MLPReward, MLPSettings
+from prefrl.sample.select import groups
 from prefrl.types import Floats
 
 
@@ -21,6 +36,17 @@ def _task(**settings: object) -> GymnasiumTask:
 def _act(observations: Floats) -> tuple[Floats, Floats]:
     actions = observations[:, :1] * 0.5
     return actions, actions
+
+
+def _alternating() -> Act:
+    """Push left and right by turns: a pole stands for some 30 steps."""
+    turn = iter(range(10_000))
+
+    def act(observations: Floats) -> tuple[Floats, Floats]:
+        actions = np.tile(np.eye(2, dtype=np.float32)[next(turn) % 2], (len(observations), 1))
+        return actions, actions
+
+    return act
 
 
 def _rollout(steps: int = 17, count: int = 2) -> Rollout:
@@ -86,6 +112,57 @@ def test_a_first_rollout_goes_on_until_it_holds_enough() -> None:
     few = first_rollout(task, _act, 3, 2, np.random.default_rng(0))
     many = first_rollout(task, _act, 25, 2, np.random.default_rng(0))
     assert (few.ends.shape, many.ends.shape) == ((1, 7), (2, 21))
+
+
+@pytest.mark.parametrize("most", [1, 4, 100])
+def test_steps_of_a_first_rollout_are_shared_by_as_many_segments_as_promised(most: int) -> None:
+    task = _task(horizon=40, segment_steps=10)
+    rollout = first_rollout(task, _act, 96, most, np.random.default_rng(0))
+    assert rollout.ends.size == 96 * 10 / OVERLAP  # six episodes, though three hold that many windows
+
+
+def test_a_first_rollout_stops_as_soon_as_it_holds_enough_where_episodes_end_early() -> None:
+    task = _task(env="CartPole-v1", horizon=60, segment_steps=44, variable_horizon=True)
+    rollout = first_rollout(task, _alternating(), 40, 2, np.random.default_rng(0))
+    less = Rollout(**{name: values[:, :-60] for name, values in rollout.state().items()})
+    assert rollout.ends[:, :-1].any()
+    assert len(windows(less, 44)[0]) < 40 <= len(windows(rollout, 44)[0])
+
+
+def test_episodes_that_are_shorter_than_segments_are_an_error_and_not_endless() -> None:
+    task = _task(env="CartPole-v1", horizon=200, segment_steps=150, variable_horizon=True)
+    right = np.array([0.0, 1.0], np.float32)
+    with pytest.raises(
+        ValueError, match=r"hold 0 segments of 150 steps.* 20 were.*longest episode seen had (9|10|11) "
+    ):
+        first_rollout(task, lambda o: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0))
+
+
+def test_windows_are_counted_across_parts_as_in_the_whole() -> None:
+    ends = np.random.default_rng(0).random((3, 40)) < 0.15
+    first = _ages(ends[:, :17], np.zeros(3, np.int64))
+    second = _ages(ends[:, 17:], np.where(ends[:, 16], 0, first[:, -1]))
+    ages = np.concatenate([first, second], 1)
+    for row, ended in zip(ages, ends, strict=True):
+        expected, age = [], 0
+        for end in ended:
+            expected.append(age := age + 1)
+            age = 0 if end else age
+        assert row.tolist() == expected
+
+
+@pytest.mark.parametrize("preset", ["pendulum", "cartpole"])
+def test_a_preset_s_first_pool_costs_little_and_gives_all_queries(preset: str) -> None:
+    config: Any = Config.load(f"control/{preset}")
+    loop, rng = config.loop, np.random.default_rng(0)
+    task = config.task.build()
+    learner = config.learner.build(task, rng)
+    count = loop.asked_by(1)
+    pool = learner.sample(int(count * 2 * loop.pool), rng)
+    assert len(groups(pool, 2, rng)) >= 1.5 * count
+    assert learner.steps.query <= 0.05 * loop.rounds * config.learner.steps_per_round
+    if preset == "pendulum":
+        assert learner.steps.query + loop.rounds * config.learner.steps_per_round <= 80_000
 
 
 def test_evaluation_means_over_first_episodes_only() -> None:

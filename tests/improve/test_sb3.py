@@ -166,6 +166,31 @@ def test_discrete_actions_are_seen_one_hot_from_any_start() -> None:
     assert executed(gymnasium.spaces.Discrete(3, start=5), np.array([5, 7])).tolist() == [[1, 0, 0], [0, 0, 1]]
 
 
+@both
+@pytest.mark.parametrize("bare", [True, False])
+def test_a_shrunk_round_is_one_small_rollout_that_still_learns(
+    store: Store[Segment], algorithm: dict[str, Any], bare: bool
+) -> None:
+    late = {"learning_starts": 1000} if algorithm is SAC_ else {}
+    options = {} if bare else {**algorithm["options"], **late, "batch_size": 20}
+    values = {"algorithm": algorithm["algorithm"], "options": options, "steps_per_round": 40960, "policy": NET}
+    settings = SB3Settings.model_validate({**values, "environments": 2})
+    small = settings.shrunk()
+    assert (small.steps_per_round <= 128, small.evaluation_episodes) == (True, 1)
+    assert settings.work() / small.work() == 40960 / small.steps_per_round
+    learner = small.build(point(), np.random.default_rng(0))
+    before = _bytes(learner)
+    learner.improve(Known(), store, np.random.default_rng(0))
+    assert learner.steps.learn == small.steps_per_round
+    assert _bytes(learner) != before
+
+
+def test_a_shrunk_round_hides_no_mistake_in_the_settings() -> None:
+    settings = SB3Settings(environments=2, steps_per_round=100, options={"n_steps": 20, "batch_size": 40})
+    with pytest.raises(ConfigError, match="must be a multiple of 40"):
+        settings.shrunk().build(point(), np.random.default_rng(0))
+
+
 def test_steps_that_the_algorithm_would_overshoot_are_refused() -> None:
     with pytest.raises(ConfigError, match="must be a multiple of 40"):
         _learner(point(), PPO, steps_per_round=100)

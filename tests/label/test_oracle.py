@@ -40,7 +40,7 @@ def test_equal_gold_is_a_tie(make_query: Ask, rng: np.random.Generator) -> None:
 def test_mistakes_come_at_the_rate_asked_for(store: Store[Segment], make_query: Ask) -> None:
     queries = [make_query(0.0, 1.0) for _ in range(300)]
     store.ask(queries)
-    Oracle(OracleSettings(error_rate=0.2)).answer(store, np.random.default_rng(1))
+    Oracle(OracleSettings(mistake_rate=0.2)).answer(store, np.random.default_rng(1))
     truth = {q.id: float(q.candidates[0].gold.sum()) for q in queries}  # type: ignore[union-attr]
     wrong = [j.judgement.preference != truth[j.query.id] for j in store.judged() if isinstance(j.judgement, Comparison)]
     assert np.mean(wrong) == pytest.approx(0.2, abs=0.06)
@@ -55,7 +55,7 @@ def test_left_and_right_are_shown_at_random(store: Store[Segment], make_query: A
 def test_answers_do_not_depend_on_what_was_answered_before(store: Store[Segment], make_query: Ask) -> None:
     """A run that was killed half way through its answers gets the same ones when it goes on."""
     queries = [make_query(0.0, 1.0) for _ in range(20)]
-    oracle = Oracle(OracleSettings(error_rate=0.5))
+    oracle = Oracle(OracleSettings(mistake_rate=0.5))
     whole = oracle_answer(oracle, queries, store, 20)
     again = Store[Segment](store.folder.parent / "again")
     with again:

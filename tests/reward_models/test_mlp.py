@@ -42,6 +42,19 @@ def test_a_score_is_the_sum_of_the_rewards_of_its_steps() -> None:
     np.testing.assert_allclose(model.score(segments), model.member_scores(segments).mean(0), rtol=1e-6)
 
 
+def test_raw_scores_are_the_fitted_logits_and_asking_for_them_changes_nothing() -> None:
+    model, segments = _model(), _segments(8, (10, 4))
+    stacked = model.stack(segments)
+    fitted = model.scores(stacked).detach().numpy()
+    model.settle(stacked)
+    before = {name: torch.as_tensor(value).clone() for name, value in model.state().items()}
+    raw = model.raw_member_scores(segments)
+    model.raw_member_scores(_segments(3, seed=9))
+    np.testing.assert_allclose(raw, fitted, rtol=1e-5, atol=1e-5)
+    assert abs(raw - model.member_scores(segments)).max() > 1.0
+    assert all(torch.equal(before[name], torch.as_tensor(value)) for name, value in model.state().items())
+
+
 def test_padding_changes_nothing() -> None:
     model, segments = _model(), _segments(4, (10, 3))
     stacked = model.stack(segments)

@@ -90,6 +90,7 @@ def test_settling_gives_each_member_mean_zero_and_unit_spread_on_what_it_saw(
     raw = reward.scores(reward.stack(candidates)).detach().numpy()
     reward.settle(reward.stack(candidates))
     scores = reward.member_scores(candidates)
+    np.testing.assert_allclose(reward.raw_member_scores(candidates), raw, atol=1e-5)
     np.testing.assert_allclose(scores.mean(1), 0, atol=1e-5)
     np.testing.assert_allclose(scores.std(1), 1, atol=1e-4)
     np.testing.assert_allclose(scores, (raw - raw.mean(1, keepdims=True)) / raw.std(1, keepdims=True), atol=1e-4)
