@@ -96,7 +96,9 @@ def _make(settings: CloningSettings, grammar: Grammar, folder: Path) -> None:
 def _load(folder: Path) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
     verify(folder)
     with _quiet():
-        model = LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32, local_files_only=True)
+        model = LlamaForCausalLM.from_pretrained(
+            folder, dtype=torch.float32, local_files_only=True, use_safetensors=True
+        )
     model.eval()  # type: ignore[no-untyped-call]
     return model, PreTrainedTokenizerFast.from_pretrained(folder, local_files_only=True)
 
