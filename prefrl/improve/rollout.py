@@ -16,8 +16,8 @@ from prefrl.types import Evaluation, Floats, Segment, State
 Act: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
 """(n, O) observations -> (n, A) what the policy chose, and (n, A) what the environment is to execute."""
 EXAMPLES, EXAMPLE_SECONDS = 3, 4.0
-OVERLAP = 4
-"""How many segments of a first pool share a step, on average: an episode is not to be spent on every few segments."""
+OVERLAP = 24
+"""How many segments of a first pool share a step, on average. A first pool is dense on purpose: docs/decisions.md."""
 PATIENCE = 4
 """A first pool is given up after this many times the steps of as many segments that share none."""
 
