@@ -111,14 +111,14 @@ def test_a_first_rollout_goes_on_until_it_holds_enough() -> None:
     task = _task()
     few = first_rollout(task, _act, 3, 2, np.random.default_rng(0))
     many = first_rollout(task, _act, 25, 2, np.random.default_rng(0))
-    assert (few.ends.shape, many.ends.shape) == ((1, 7), (2, 21))
+    assert (few.ends.shape, many.ends.shape) == ((1, 7), (1, 35))
 
 
 @pytest.mark.parametrize("most", [1, 4, 100])
 def test_steps_of_a_first_rollout_are_shared_by_as_many_segments_as_promised(most: int) -> None:
-    task = _task(horizon=40, segment_steps=10)
-    rollout = first_rollout(task, _act, 96, most, np.random.default_rng(0))
-    assert rollout.ends.size == 96 * 10 / OVERLAP  # six episodes, though three hold that many windows
+    task = _task(horizon=200, segment_steps=40)
+    rollout = first_rollout(task, _act, 480, most, np.random.default_rng(0))
+    assert rollout.ends.size == 480 * 40 / OVERLAP  # four episodes, though three hold that many windows
 
 
 def test_a_first_rollout_stops_as_soon_as_it_holds_enough_where_episodes_end_early() -> None:
