@@ -85,7 +85,7 @@ def round_line(round: Round[Any]) -> Text:
         ("steps/learn", "steps", ",.0f"),
     ):
         if not math.isnan(m.get(key, math.nan)):
-            parts.append(Text(f"{label} {m[key] + 0.0:{form}}"))
+            parts.append(Text(f"{label} {m[key]:z{form}}"))
     seconds = sum(v for k, v in m.items() if k.startswith("seconds/"))
     return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
 
