@@ -28,6 +28,10 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is writt
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
 
 
+FEW = 20
+"""With fewer held-out comparisons than this an accuracy is mostly luck."""
+
+
 class Form(StrEnum):
     """How judgements lie in files."""
 
@@ -89,7 +93,7 @@ def label(
     except KeyboardInterrupt:
         say(f"stopped; what was answered is in {out}. Go on with the same command")
         raise
-    say(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skips, in {out}")
+    say(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skipped, in {out}")
 
 
 @app.command()
@@ -102,12 +106,20 @@ def fit(
     """Fit a reward model on judgements, and save it."""
     from prefrl import stages
     from prefrl.components import ConfigError
-    from prefrl.console import console, metrics_table
+    from prefrl.console import console, metrics_table, say
 
+    if not source.exists():
+        raise ConfigError(f"{source}: no such file or folder")
+    if config is None and source.is_file():
+        raise ConfigError(f"{source} is a file of preferences: say which settings to use, --config text/reviews say")
     if config is None and not (source / "config.yaml").is_file():
         raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
     fitted = stages.fit_reward(_load(config or str(source / "config.yaml"), overrides), source, out)
     console.print(metrics_table(f"reward model in {out}", fitted.metrics))
+    if fitted.metrics["held_out"] < FEW:
+        say(
+            f"only {fitted.metrics['held_out']:.0f} comparisons were held out: their accuracy says little yet", "yellow"
+        )
 
 
 @app.command()
@@ -190,6 +202,8 @@ def describe(
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of config files instead.")] = False,
 ) -> None:
     """Explain a component's settings, or a preset; without a name, list the kinds."""
+    from rich.text import Text
+
     from prefrl.console import console
     from prefrl.explain import explain
 
@@ -199,7 +213,7 @@ def describe(
         print(text(), end="")
         return
     for part in explain(kind):
-        console.print(part)
+        console.print(part, soft_wrap=isinstance(part, Text))
 
 
 @app.command()
@@ -232,7 +246,7 @@ def _drive(running: Run) -> None:
             with progress(running.loop, quiet=person) as bar:
                 for round in running:
                     bar.update(bar.task_ids[0], completed=round.number)
-                    console.print(round_line(round))
+                    console.print(round_line(round), soft_wrap=True)
                     for note in round.notes:
                         say(f"  {note}", "yellow")
         except KeyboardInterrupt:

@@ -114,8 +114,8 @@ def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
 def table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
     """A plain table; cells are text, never markup."""
     made = Table(title=Text(title), title_justify="left")
-    for column in columns:
-        made.add_column(column, overflow="fold")
+    for number_, column in enumerate(columns):
+        made.add_column(column, overflow="fold", no_wrap=number_ == 0)
     for row in rows:
         made.add_row(*(Text(cell) for cell in row))
     return made

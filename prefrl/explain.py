@@ -28,8 +28,7 @@ def explain(name: str | None) -> list[RenderableType]:
         rows = [(role[:-1], ", ".join(kinds(role))) for role in TABLE]
         return [table("kinds: prefrl describe KIND", ("role", "kinds"), [*rows, ("always there", ", ".join(ALWAYS))])]
     if name in presets():
-        config = Config.load(name)
-        return [Text(config.dump()), *_formula(config.learner)]
+        return [_yaml(Config.load(name))]
     if name in ALWAYS:
         return _component(name, ALWAYS[name])
     roles: list[Role] = [role for role in TABLE if name in kinds(role)]
@@ -46,6 +45,13 @@ def _component(title: str, cls: type[Settings]) -> list[RenderableType]:
     return [intro, Text(), shown, *(_formula(cls()) if _has_defaults(cls) else [])]
 
 
+def _yaml(config: Config) -> Text:
+    """A config as a file that can be run; what its learner optimises stands in comments."""
+    formula: Any = getattr(config.learner, "formula", None)
+    lines = ["what it optimises:", *formula().splitlines()] if formula else []
+    return Text(config.dump() + "".join(f"# {line}\n" for line in lines), end="")
+
+
 def _formula(settings: Settings) -> list[RenderableType]:
     """The objective, of learners that can spell it out."""
     formula: Any = getattr(settings, "formula", None)
@@ -60,6 +66,8 @@ def _type(field: FieldInfo) -> str:
     """The type in words, with its bounds."""
     annotation: Any = field.annotation
     choices = get_args(annotation)
+    if choices and choices[-1] is Ellipsis:
+        return f"list of {_plain(choices[0])}"
     name = getattr(annotation, "__name__", None) if not choices else " | ".join(_plain(c) for c in choices)
     bounds = [f"{SIGNS[type(m)]} {next(iter(vars_of(m)))}" for m in field.metadata if type(m) in SIGNS]
     return ", ".join([name or str(annotation), *bounds])
@@ -81,4 +89,6 @@ def _default(field: FieldInfo) -> str:
         return "..."
     if field.default is PydanticUndefined:
         return "required"
+    if isinstance(field.default, tuple):
+        return str(list(field.default))
     return "null" if field.default is None else str(field.default)

@@ -61,13 +61,13 @@ def _learning(record: Record) -> tuple[Card, ...]:
             "Learned reward",
             plots.lines("learned", at, [Line(learned, "learned", dash="--")]),
             "What the policy was trained on. It has no absolute scale and is fitted anew each round: "
-            "read its direction, and do not compare its values with gold or between runs.",
+            "it may fall while the policy gets better. Do not compare its values with gold, or between rounds.",
         ),
         Card(
             "Do the two agree?",
             plots.path("agreement", learned, gold, ("learned reward", "gold")),
-            "One dot a round, joined in order. Up and to the right is progress. Right and down is the mark of a policy "
-            "that exploits errors of the reward model, or of a new fit that moved the scale.",
+            "One dot a round, joined in order. Up is progress. Right and down is the mark of a policy "
+            "that exploits errors of the reward model; left is a new fit that moved the scale.",
         ),
     )
 

@@ -108,8 +108,10 @@ def _parse(row: Any) -> tuple[Query[Response], str]:
     if not isinstance(row, dict):
         raise ValueError(f"expected an object, got {type(row).__name__}")
     for name in COLUMNS:
-        if not isinstance(row.get(name), str):
-            raise ValueError(f"column {name!r}: expected a string, got {row.get(name, 'nothing')!r}")
+        if name not in row:
+            raise ValueError(f"column {name!r} is missing; there are: {', '.join(map(str, row))}")
+        if not isinstance(row[name], str):
+            raise ValueError(f"column {name!r}: expected a string, got {row[name]!r}")
     if row["chosen"] == row["rejected"]:
         raise ValueError("chosen and rejected are the same text")
     chosen, rejected = (Response(row["prompt"], row[name]) for name in ("chosen", "rejected"))

@@ -93,7 +93,7 @@ class Terminal:
                 return "q"
             if understood(typed, count):
                 return typed
-            self.console.print(Text(f"expected one of the following, got {typed!r}", style="red"))
+            self.console.print(Text(f"{typed!r} is no answer; type one of these:", style="red"))
 
     def _undo(self, store: Store[C], done: list[str]) -> None:
         if not done:

@@ -60,7 +60,7 @@ def test_tables_are_read_as_well(text_store: Store[Response], tmp_path: Path, su
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ('{"prompt": "p", "chosen": "a"}', "row 2: column 'rejected': expected a string, got 'nothing'"),
+        ('{"prompt": "p", "chosen": "a"}', "row 2: column 'rejected' is missing; there are: prompt, chosen"),
         ('{"prompt": "p", "chosen": NaN, "rejected": "b"}', "row 2: NaN is not a value"),
         ('{"prompt": "p", "chosen": 3, "rejected": "b"}', "row 2: column 'chosen': expected a string, got 3"),
         ('{"prompt": "p", "chosen": "a", "rejected": "a"}', "row 2: chosen and rejected are the same"),
