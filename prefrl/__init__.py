@@ -3,14 +3,27 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from prefrl.types import Batch, Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.graph import Batch
+from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
 
 if TYPE_CHECKING:
     from prefrl.config import Config as Config
     from prefrl.rundir import Run as Run
 
 __version__ = "0.1.0"
-__all__ = ["Batch", "Comparison", "Config", "Query", "Ranking", "Response", "Run", "Segment", "Skip"]
+__all__ = [
+    "Batch",
+    "Choice",
+    "Comparison",
+    "Config",
+    "Query",
+    "Ranking",
+    "Rating",
+    "Response",
+    "Run",
+    "Segment",
+    "Skip",
+]
 _LATER = {"Config": "prefrl.config", "Run": "prefrl.rundir"}
 
 

@@ -15,7 +15,7 @@ from rich.text import Text
 from prefrl.components import TABLE, ConfigError, Role, Settings, kinds, settings_class, suggest
 from prefrl.config import Config, presets
 from prefrl.console import table
-from prefrl.fit.trainer import FittingSettings
+from prefrl.fit.settings import FittingSettings
 from prefrl.loop import LoopSettings
 
 ALWAYS: dict[str, type[Settings]] = {"fitting": FittingSettings, "loop": LoopSettings}

@@ -14,7 +14,8 @@ from typing import Generic
 from pydantic import Field
 
 from prefrl.components import Settings
-from prefrl.fit.trainer import FittingSettings, NothingToFit, fit
+from prefrl.fit.settings import FittingSettings
+from prefrl.fit.trainer import NothingToFit, fit
 from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
 from prefrl.seeding import Streams, streams
 from prefrl.types import C, Evaluation, Fitted, Metrics, Round
@@ -85,29 +86,30 @@ class Loop(Generic[C]):
         """One turn of the loop: the five stages, in order."""
         number = self.round + 1
         rng = streams(self.seed, number)
-        self.ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
+        pool = self.ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
         with self._timed("label"):
             self.labeler.answer(self.store, rng.label)
-        fitted = self._fit(rng)
+        fitted = self._fit(rng, pool)
         improved: Metrics = {}
         if self.reward.fitted:
             with self._timed("improve"):
                 improved = self.learner.improve(self.reward, self.store, rng.improve)
         return self._finish(number, improved, self._evaluate(rng), fitted)
 
-    def ask(self, count: int, rng: Streams) -> None:
-        """Stage 1: sample a pool, and ask about the part of it that is worth a label.
+    def ask(self, count: int, rng: Streams) -> list[C]:
+        """Stage 1: sample a pool, and ask about the part of it that is worth a label; returns the pool.
 
         Raises `ValueError` where no two candidates of the pool can be compared.
         """
         if count <= 0:
-            return
+            return []
         with self._timed("sample"):
             pool = self.learner.sample(int(count * self.candidates * self.settings.pool), rng.sample)
             queries = self.selector.select(pool, self.reward, count, rng.select)
             if len(queries) < count:
                 self._note_shortage(len(queries), count, len(pool))
             self.store.ask(queries)
+            return pool
 
     def _note_shortage(self, found: int, wanted: int, pool: int) -> None:
         """A pool may hold too few candidates that can be compared; none at all is a mistake in the settings."""
@@ -119,10 +121,10 @@ class Loop(Generic[C]):
             )
         self._notes.append(text)
 
-    def _fit(self, rng: Streams) -> Fitted | None:
+    def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
         with self._timed("fit"):
             try:
-                return fit(self.reward, self.store, self.fitting, rng.fit)
+                return fit(self.reward, self.store, self.fitting, rng.fit, pool)
             except NothingToFit as error:  # people may not have answered yet: what is known stays
                 if self.settings.labels:
                     self._notes.append(f"nothing to fit: {error}")

@@ -5,7 +5,7 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -184,17 +184,27 @@ class RewardModel(Protocol[C_contra]):
 
     def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 
-    def settle(self, stacked: Mapping[str, torch.Tensor]) -> None:
-        """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates."""
+    def settle(self, stacked: Mapping[str, torch.Tensor], loss: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+        """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates.
+
+        Returns their raw scores (E, N). `loss` maps such scores to the (E,) negative log-likelihoods of all training
+        judgements, differentiably: for models that are solved for, or that want the curvature.
+        """
+
+    def calibrate(self, temperature: float) -> None:
+        """Divide logits by this from now on, until the next fit ends (Guo et al. 2017)."""
 
     def raw_member_scores(self, candidates: Sequence[C_contra]) -> Floats:
-        """(E, N) the scores that the likelihood was fitted on, without gradients; changes nothing."""
+        """(E, N) scores whose differences are calibrated logits: those of the fit over its temperature."""
 
     def member_scores(self, candidates: Sequence[C_contra]) -> Floats:
         """(E, N) scores after each member's shift and scale, without gradients."""
 
     def score(self, candidates: Sequence[C_contra]) -> Floats:
-        """(N,) what learners optimise: the members' mean of `member_scores`."""
+        """(N,) what learners optimise: `member_scores`, put together as the settings say (their mean, by default)."""
+
+    def features(self, candidates: Sequence[C_contra]) -> Floats:
+        """(N, d) what the candidates look like, for telling near ones from far ones; changes nothing."""
 
     def state(self) -> State: ...
 
@@ -205,8 +215,16 @@ class RewardModel(Protocol[C_contra]):
 class StepRewardModel(RewardModel[Segment], Protocol):
     """A reward model for control: a segment's score is the sum of its steps' rewards."""
 
-    def rewards(self, observations: Floats, actions: Floats) -> Floats:
-        """(B, T) rewards of observations (B, T, O) and actions (B, T, A): shifted, scaled, averaged over members."""
+    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+        """(B, T) rewards of observations (B, T, O) and actions (B, T, A): shifted, scaled, put together.
+
+        `begins` (B, T) bool marks the first step of each episode, for rewards that look back; without it each row is
+        one episode, or a piece of one.
+        """
+
+    @property
+    def memory(self) -> int:
+        """How many steps a reward looks at: 1 where it hangs on its own step alone."""
 
 
 class Learner(Protocol[C]):

@@ -17,13 +17,30 @@ from sqlalchemy import Row
 
 from prefrl.blobs import read_arrays, write_arrays
 from prefrl.log import EventLog, StoreError, row
-from prefrl.types import Answer, C, Candidate, Comparison, Floats, Judged, Query, Ranking, Response, Segment, Skip
+from prefrl.types import (
+    Answer,
+    C,
+    Candidate,
+    Choice,
+    Comparison,
+    Floats,
+    Judged,
+    Query,
+    Ranking,
+    Rating,
+    Response,
+    Segment,
+    Skip,
+    check_fits,
+)
 
 WRITERS = 16
 """Files written at once."""
-ANSWERS: dict[str, type[Comparison] | type[Ranking] | type[Skip]] = {
+ANSWERS: dict[str, type[Answer]] = {
     "comparison": Comparison,
     "ranking": Ranking,
+    "choice": Choice,
+    "rating": Rating,
     "skip": Skip,
 }
 
@@ -103,11 +120,7 @@ class Store(Generic[C]):
         for answer in answers:
             if answer.query not in view.queries:
                 raise StoreError(f"an answer to query {answer.query[:12]}, which was never asked")
-            size = len(view.queries[answer.query])
-            if (isinstance(answer, Ranking) and len(answer.ranks) != size) or (
-                isinstance(answer, Comparison) and size != 2
-            ):
-                raise StoreError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
+            _check_size(answer, len(view.queries[answer.query]))
             kind = next(k for k, cls in ANSWERS.items() if isinstance(answer, cls))
             body = {k: v for k, v in asdict(answer).items() if k not in ("query", "labeler")}
             rows.append(row(self._answer_id(answer.query, answer.labeler), kind, answer.query, answer.labeler, body))
@@ -256,10 +269,10 @@ def _check_event(one: dict[str, Any], queries: dict[str, list[str]], candidates:
 
 
 def _check_size(answer: Answer, size: int) -> None:
-    """A comparison judges two candidates, a ranking each one of its query's."""
-    judged = {Comparison: 2, Ranking: len(getattr(answer, "ranks", ())), Skip: size}[type(answer)]
-    if judged != size:
-        raise StoreError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
+    try:
+        check_fits(answer, size)
+    except ValueError as error:
+        raise StoreError(str(error)) from None
 
 
 def _check_query(id: str, body: dict[str, Any], candidates: dict[str, Any]) -> list[str]:

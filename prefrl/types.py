@@ -7,8 +7,7 @@ batch, M comparisons, E ensemble members, B sequences, L tokens, V vocabulary.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
@@ -101,15 +100,15 @@ def gold_score(candidate: Candidate) -> float:
 
 @dataclass(frozen=True)
 class Query(Generic[C]):
-    """K >= 2 distinct candidates of one context, put side by side, unanswered."""
+    """K distinct candidates of one context, put side by side, unanswered. Only a `Rating` can answer K = 1."""
 
     candidates: tuple[C, ...]
     """In the order of their ids, whatever order came: what is first says nothing, and asking twice is asking once."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(sorted(self.candidates, key=lambda c: c.id)))
-        if len(self.candidates) < 2:
-            raise ValueError(f"a query needs at least 2 candidates, got {len(self.candidates)}")
+        if not self.candidates:
+            raise ValueError("a query needs at least one candidate, got none")
         if len({c.id for c in self.candidates}) < len(self.candidates):
             raise ValueError("a query may not compare a candidate with itself")
         if len({c.context for c in self.candidates}) > 1:
@@ -127,12 +126,15 @@ class Comparison:
 
     query: str
     preference: float
-    """In [0, 1]: the probability that the first candidate is better; 0.5 is a tie."""
+    """In [0, 1]: the probability that the first candidate is better; 0.5 is a tie, a strength lies between."""
     labeler: str = ""
     shown: tuple[int, ...] = ()
     """The order in which the candidates were shown; the preference itself is in the query's own order."""
+    weight: float = 1.0
+    """How much the judgement counts in a fit."""
 
     def __post_init__(self) -> None:
+        _check_weight(self.weight)
         if not 0.0 <= self.preference <= 1.0:
             raise ValueError(f"a preference must lie in [0, 1], got {self.preference}")
 
@@ -146,10 +148,48 @@ class Ranking:
     """A rank for each candidate, in the query's own order; 0 is best, equal ranks are ties."""
     labeler: str = ""
     shown: tuple[int, ...] = ()
+    weight: float = 1.0
 
     def __post_init__(self) -> None:
+        _check_weight(self.weight)
         if len(self.ranks) < 2 or min(self.ranks) < 0:
             raise ValueError(f"a ranking needs a rank >= 0 for each of at least 2 candidates, got {self.ranks}")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The best of K candidates; nothing is said of the others."""
+
+    query: str
+    best: int
+    """Which candidate, counted from 0 in the query's own order."""
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_weight(self.weight)
+        if self.best < 0:
+            raise ValueError(f"the best candidate is counted from 0, got {self.best}")
+
+
+@dataclass(frozen=True)
+class Rating:
+    """Each candidate on a scale of its own right, such as one to five stars."""
+
+    query: str
+    levels: tuple[int, ...]
+    """A level for each candidate, in the query's own order; 0 is worst, `scale` - 1 is best."""
+    scale: int
+    """How many levels there are."""
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_weight(self.weight)
+        if self.scale < 2 or not self.levels or not all(0 <= level < self.scale for level in self.levels):
+            raise ValueError(f"a rating needs levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}")
 
 
 @dataclass(frozen=True)
@@ -162,80 +202,36 @@ class Skip:
     shown: tuple[int, ...] = ()
 
 
-Judgement: TypeAlias = Comparison | Ranking
-Answer: TypeAlias = Comparison | Ranking | Skip
+Judgement: TypeAlias = Comparison | Ranking | Choice | Rating
+Answer: TypeAlias = Judgement | Skip
 
 
 @dataclass(frozen=True)
 class Judged(Generic[C]):
-    """A query with one judgement on it."""
+    """A query with one judgement on it. Raises `ValueError` where the two do not fit."""
 
     query: Query[C]
     judgement: Judgement
 
-
-@dataclass(frozen=True, eq=False)
-class Batch(Generic[C]):
-    """Judgements as a graph: every candidate once, comparisons as edges between them."""
-
-    candidates: tuple[C, ...]
-    """N distinct candidates: each is scored once, however often it was compared."""
-    edges: Integers
-    """(M, 2) int64: indices of the two candidates compared."""
-    preference: Floats
-    """(M,) float32 in [0, 1]: the probability that edge[0] is better."""
-    weight: Floats
-    """(M,) float32: the pairs implied by one ranking of K candidates share a weight of K - 1."""
-    group: Integers
-    """(M,) int64: which judgement each edge came from; edges of one group are not independent."""
-
-    def __len__(self) -> int:
-        return len(self.edges)
-
-    def subset(self, keep: npt.NDArray[np.bool_]) -> Batch[C]:
-        """The same candidates with only the edges where `keep` (M,) is true."""
-        return replace(
-            self,
-            edges=self.edges[keep],
-            preference=self.preference[keep],
-            weight=self.weight[keep],
-            group=self.group[keep],
-        )
+    def __post_init__(self) -> None:
+        check_fits(self.judgement, len(self.query.candidates))
 
 
-def batch(judged: Sequence[Judged[C]]) -> Batch[C]:
-    """Turn judgements into a `Batch`; a ranking becomes all the pairs that it implies."""
-    index: dict[str, int] = {}
-    candidates: list[C] = []
-    rows: list[tuple[int, int, float, float, int]] = []
-    for group, one in enumerate(judged):
-        for candidate in one.query.candidates:
-            if index.setdefault(candidate.id, len(candidates)) == len(candidates):
-                candidates.append(candidate)
-        at = [index[c.id] for c in one.query.candidates]
-        pairs = implied_pairs(one.judgement)
-        share = (len(at) - 1) / max(len(pairs), 1)
-        rows += [(at[i], at[j], preference, share, group) for i, j, preference in pairs]
-    columns = list(zip(*rows, strict=True)) if rows else [(), (), (), (), ()]
-    return Batch(
-        candidates=tuple(candidates),
-        edges=np.array([columns[0], columns[1]], np.int64).T.reshape(-1, 2),
-        preference=np.array(columns[2], np.float32),
-        weight=np.array(columns[3], np.float32),
-        group=np.array(columns[4], np.int64),
-    )
-
-
-def implied_pairs(judgement: Judgement) -> list[tuple[int, int, float]]:
-    """(i, j, preference that i is better), one for each pair of candidates that the judgement speaks of."""
-    if isinstance(judgement, Comparison):
-        return [(0, 1, judgement.preference)]
-    ranks = judgement.ranks
-    return [
-        (i, j, 0.5 + 0.5 * float(np.sign(ranks[j] - ranks[i])))
-        for i in range(len(ranks))
-        for j in range(i + 1, len(ranks))
-    ]
+def check_fits(answer: Answer, size: int) -> None:
+    """Raise `ValueError` where an answer does not fit a query of `size` candidates."""
+    match answer:
+        case Comparison():
+            fits = size == 2
+        case Ranking(ranks=ranks):
+            fits = size == len(ranks)
+        case Choice(best=best):
+            fits = size >= 2 and best < size
+        case Rating(levels=levels):
+            fits = size == len(levels)
+        case Skip():
+            fits = True
+    if not fits:
+        raise ValueError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
 
 
 class Steps(NamedTuple):
@@ -288,3 +284,8 @@ def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
         digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def _check_weight(weight: float) -> None:
+    if not 0.0 < weight < float("inf"):
+        raise ValueError(f"a judgement's weight must be positive and finite, got {weight}")

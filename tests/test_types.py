@@ -1,17 +1,21 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from prefrl.types import (
+    Answer,
+    Choice,
     Comparison,
-    Judged,
     Query,
     Ranking,
+    Rating,
     Response,
     Segment,
+    Skip,
     Steps,
-    batch,
+    check_fits,
     gold_score,
-    implied_pairs,
 )
 
 
@@ -41,7 +45,7 @@ def test_a_query_does_not_depend_on_the_order_in_which_it_was_made() -> None:
 @pytest.mark.parametrize(
     ("candidates", "message"),
     [
-        ((response("a"),), "at least 2"),
+        ((), "at least one"),
         ((response("a"), response("a")), "with itself"),
         ((response("a"), response("b", prompt="q")), "one context"),
     ],
@@ -62,28 +66,6 @@ def test_a_segment_with_unequal_lengths_is_refused() -> None:
         Segment(np.zeros((3, 1)), np.zeros((2, 1)), "e", 0)
 
 
-def test_a_ranking_implies_all_pairs_ties_included() -> None:
-    assert implied_pairs(Ranking("q", (0, 1, 1))) == [(0, 1, 1.0), (0, 2, 1.0), (1, 2, 0.5)]
-    assert implied_pairs(Comparison("q", 0.7)) == [(0, 1, 0.7)]
-
-
-def test_a_batch_holds_each_candidate_once_and_a_ranking_counts_as_its_candidates_less_one() -> None:
-    a, b, c, d = (response(t) for t in "abcd")
-    three, two = Query((a, b, c)), Query((a, d))
-    made = batch([Judged(three, Ranking(three.id, (0, 1, 2))), Judged(two, Comparison(two.id, 1.0))])
-    assert {x.id for x in made.candidates} == {x.id for x in (a, b, c, d)}
-    assert len(made) == 4
-    assert made.group.tolist() == [0, 0, 0, 1]
-    np.testing.assert_allclose(made.weight, [2 / 3, 2 / 3, 2 / 3, 1])
-    assert made.subset(np.array([True, False, False, True])).group.tolist() == [0, 1]
-
-
-def test_a_batch_of_nothing_is_empty_and_well_shaped() -> None:
-    made = batch(list[Judged[Response]]())
-    assert made.edges.shape == (0, 2)
-    assert len(made) == 0
-
-
 def test_gold_is_only_there_where_it_was_attached() -> None:
     assert gold_score(response("a", gold=0.5)) == 0.5
     with pytest.raises(ValueError, match="carries no gold"):
@@ -92,3 +74,38 @@ def test_gold_is_only_there_where_it_was_attached() -> None:
 
 def test_steps_add_up_by_purpose() -> None:
     assert Steps(1, 2, 3).add(learn=10).add(query=20, evaluate=30) == (11, 22, 33)
+
+
+@pytest.mark.parametrize(
+    ("answer", "sizes"),
+    [
+        (Comparison("q", 1.0), {2}),
+        (Ranking("q", (0, 1, 1)), {3}),
+        (Choice("q", 1), {2, 3, 4}),
+        (Rating("q", (4,), 5), {1}),
+        (Skip("q"), {1, 2, 3, 4}),
+    ],
+)
+def test_an_answer_fits_queries_of_its_own_size_only(answer: Answer, sizes: set[int]) -> None:
+    for size in (1, 2, 3, 4):
+        if size in sizes:
+            check_fits(answer, size)
+        else:
+            with pytest.raises(ValueError, match=f"has {size} candidates"):
+                check_fits(answer, size)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Ranking("q", (0,)),
+        lambda: Choice("q", -1),
+        lambda: Rating("q", (5,), 5),
+        lambda: Rating("q", (), 5),
+        lambda: Comparison("q", 1.0, weight=0.0),
+        lambda: Ranking("q", (0, 1), weight=float("nan")),
+    ],
+)
+def test_judgements_that_say_nothing_are_refused(make: Callable[[], Answer]) -> None:
+    with pytest.raises(ValueError, match="got"):
+        make()

@@ -1,38 +1,106 @@
-"""Likelihoods of judgements, on scores and edges alone: one loss serves pairs, rankings, control, text, ensembles."""
+"""Likelihoods of judgements, on scores alone: one set of losses for control, text and ensembles.
+
+Shapes: E members, S choices among at most K candidates each, R ratings. All are stable for scores of any size, and
+unchanged when all scores (and, for ratings, the thresholds) are shifted together.
+"""
 
 from __future__ import annotations
 
-import math
+from functools import cache
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
+from prefrl.types import Integers
 
-def preference_logits(scores: Tensor, edges: Tensor) -> Tensor:
+
+def preference_logits(scores: Tensor, edges: Integers) -> Tensor:
     """(E, N) scores and (M, 2) edges -> (E, M): how much better the first candidate of each edge is."""
-    return scores[:, edges[:, 0]] - scores[:, edges[:, 1]]
+    first, second = torch.as_tensor(edges).unbind(1)
+    return scores[:, first] - scores[:, second]
 
 
-def bradley_terry(logits: Tensor, preference: Tensor, error_rate: float = 0.0) -> Tensor:
-    """(E, M) negative log-likelihoods of soft preferences (M,) under Bradley and Terry 1952.
+def choice(scores: Tensor, target: Tensor, error: Tensor | float = 0.0) -> Tensor:
+    """(E, S, K) scores, -inf where there is no candidate, and (S, K) targets -> (E, S) negative log-likelihoods.
 
-    A tie is a preference of 0.5. With `error_rate` e, an answer is a coin flip with probability e (Christiano et al.
-    2017, section 2.2.3), so that one wrong label cannot drive scores to infinity. Stable for logits of any size.
+    The candidate chosen among K is drawn with probability softmax(scores) (Luce 1959). For K = 2 this is Bradley and
+    Terry 1952, and a soft preference p is the target (p, 1 - p); one stage of a ranking is that of Plackett 1975.
+    `error`: see `with_errors`.
     """
-    first, second = log_preference(logits, error_rate), log_preference(-logits, error_rate)
-    return -(preference * first + (1 - preference) * second)
+    log_p = scores.log_softmax(-1)
+    return cross_entropy(with_errors(log_p, error, scores.isfinite().sum(-1, keepdim=True)), target)
 
 
-def log_preference(logits: Tensor, error_rate: float = 0.0) -> Tensor:
-    """log P(first is judged better): log sigmoid, mixed with a coin flip."""
-    if error_rate == 0.0:
-        return logsigmoid(logits)
-    floor = torch.full_like(logits, math.log(error_rate / 2))
-    return torch.logaddexp(logsigmoid(logits) + math.log1p(-error_rate), floor)
+def davidson(scores: Tensor, target: Tensor, tied: Tensor, tie: Tensor, error: Tensor | float = 0.0) -> Tensor:
+    """As `choice`, where the answer may also be that several candidates are equally best.
+
+    A set T of n candidates is best with a weight of nu^(n - 1) times the geometric mean of exp(scores) over T, and
+    `tie` (E,) is log nu. For two candidates this is Davidson 1970; for more, Firth, Kosmidis and Turner 2019 (section
+    2), who fit one such parameter for each n. `tied` (S,): the target's candidates are tied; else it is a choice.
+    """
+    sets = _subsets(scores.shape[-1]).to(scores.dtype)
+    sizes = sets.sum(1)
+    mean = scores.masked_fill(~scores.isfinite(), 0.0) @ (sets / sizes[:, None]).T  # (E, S, 2^K - 1)
+    absent = (~scores.isfinite()).to(scores.dtype) @ sets.T > 0
+    total = (mean + tie[:, None, None] * (sizes - 1)).masked_fill(absent, -torch.inf)
+    norm, outcomes = total.logsumexp(-1, keepdim=True), (~absent).sum(-1, keepdim=True)
+    log_p = with_errors(scores - norm, error, outcomes)
+    joint = (target * scores.masked_fill(target == 0, 0.0)).sum(-1) + tie[:, None] * ((target > 0).sum(-1) - 1)
+    log_joint = with_errors((joint - norm[..., 0])[..., None], error, outcomes)[..., 0]
+    return torch.where(tied, -log_joint, cross_entropy(log_p, target))
+
+
+def rao_kupper(scores: Tensor, target: Tensor, tied: Tensor, tie: Tensor, error: Tensor | float = 0.0) -> Tensor:
+    """(E, S, 2) scores -> (E, S): as `davidson` for pairs, after Rao and Kupper 1967.
+
+    Only who is better by more than a threshold wins: P(first wins) = sigmoid(difference - threshold), and what is left
+    is a tie. `tie` (E,) is the threshold's inverse softplus, which keeps it positive.
+    """
+    difference, threshold = scores[..., 0] - scores[..., 1], torch.nn.functional.softplus(tie)[:, None]
+    wins = torch.stack([logsigmoid(difference - threshold), logsigmoid(-difference - threshold)], -1)
+    tie_ = wins.sum(-1) + torch.log(torch.expm1(2 * threshold))
+    log_p = with_errors(torch.cat([wins, tie_[..., None]], -1), error, 3)
+    return torch.where(tied, -log_p[..., 2], cross_entropy(log_p[..., :2], target))
+
+
+def rating(scores: Tensor, level: Tensor, thresholds: Tensor, error: Tensor | float = 0.0) -> Tensor:
+    """(E, R) scores, (R,) levels from 0 and increasing thresholds (E, levels - 1) -> (E, R), a cumulative logit model.
+
+    P(level <= k) = sigmoid(thresholds[k] - score) (McCullagh 1980).
+    """
+    ends = thresholds.new_full((len(thresholds), 1), torch.inf)
+    bounds = torch.cat([-ends, thresholds, ends], 1)
+    below, above = bounds[:, level] - scores, bounds[:, level + 1] - scores
+    log_p = logsigmoid(above) + logsigmoid(-below) + torch.log(-torch.expm1(below - above))
+    return -with_errors(log_p[..., None], error, bounds.shape[1] - 1)[..., 0]
+
+
+def with_errors(log_p: Tensor, error: Tensor | float, outcomes: Tensor | int) -> Tensor:
+    """log of the probability of an answer (..., K) that is, with probability `error`, one of the other outcomes.
+
+    Which of them is uniform. An answer drawn blindly with probability e (Christiano et al. 2017, section 2.2.3) is the
+    error e (n - 1) / n; an error above that is an adversary's. So one wrong answer cannot drive scores to infinity.
+    """
+    if isinstance(error, float) and error == 0.0:
+        return log_p
+    error = error[..., None] if isinstance(error, Tensor) else error
+    others = error / (outcomes - 1)
+    return torch.log((1 - error - others) * log_p.exp() + others)
+
+
+def cross_entropy(log_p: Tensor, target: Tensor) -> Tensor:
+    """(E, S, K) and (S, K) -> (E, S). What has no target may be impossible."""
+    return -(target * log_p.masked_fill(target == 0, 0.0)).sum(-1)
 
 
 def weighted_mean(losses: Tensor, weight: Tensor) -> Tensor:
     """(E, M) losses and weights (M,) or (E, M) -> one number: the sum of the members' weighted means."""
     weight = weight.expand_as(losses)
     return ((losses * weight).sum(1) / weight.sum(1).clamp(min=1e-12)).sum()
+
+
+@cache
+def _subsets(size: int) -> Tensor:
+    """(2^K - 1, K) of 0 and 1: every set of K candidates but the empty one."""
+    return ((torch.arange(1, 2**size)[:, None] >> torch.arange(size)) & 1).float()

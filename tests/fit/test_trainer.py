@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,10 +8,12 @@ import torch
 from scipy.stats import pearsonr
 
 from prefrl.components import settings_class
-from prefrl.fit.trainer import FittingSettings, NothingToFit, fit, fit_judged, split
+from prefrl.fit.settings import FittingSettings
+from prefrl.fit.trainer import NothingToFit, fit, fit_judged
+from prefrl.graph import batch
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
-from prefrl.types import Comparison, Judged, Query, Ranking, Segment, batch
+from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment
 
 WEIGHTS = np.array([1.0, -2.0, 0.5, 1.0, 0.0])
 
@@ -59,38 +62,8 @@ def test_the_scores_that_learners_get_have_mean_zero_and_unit_scale_per_step(jud
     np.testing.assert_allclose(reward.score(list(candidates)), rewards.sum(1), rtol=1e-3, atol=1e-3)
 
 
-def test_held_out_comparisons_share_no_candidate_with_the_rest(make_segment: Callable[..., Segment]) -> None:
-    pool = [make_segment() for _ in range(60)]
-    rng = np.random.default_rng(0)
-    queries = {q.id: q for q in (Query((pool[i], pool[j])) for i, j in (rng.choice(60, 2, False) for _ in range(40)))}
-    judged = [judge(q) for q in queries.values()]
-    data = batch(judged)
-    held_out = split(data, judged, 0.3)
-    assert 0 < held_out.sum() < len(data)
-    assert not set(data.edges[held_out].flatten()) & set(data.edges[~held_out].flatten())
-
-
-def test_what_was_held_out_once_is_never_trained_on_later(judged: list[Judged[Segment]]) -> None:
-    def ids(count: int) -> set[str]:
-        some = judged[:count]
-        data = batch(some)
-        return {some[g].query.id for g in data.group[split(data, some, 0.2)]}
-
-    assert ids(100) <= ids(200) <= ids(300)
-    assert len(ids(300)) == pytest.approx(60, abs=25)
-
-
-def test_all_pairs_of_a_ranking_are_held_out_together(make_query: Callable[..., Query[Segment]]) -> None:
-    queries = [make_query(0, 1, 2, 3) for _ in range(40)]
-    judged = [Judged(q, Ranking(q.id, (0, 1, 2, 3))) for q in queries]
-    data = batch(judged)
-    held_out = split(data, judged, 0.3)
-    assert all(len(set(held_out[data.group == g])) == 1 for g in np.unique(data.group))
-
-
 def test_a_split_that_would_leave_nothing_to_train_on_holds_out_nothing(judged: list[Judged[Segment]]) -> None:
     one = [next(j for j in judged if int(j.query.id[:8], 16) < 0.5 * 2**32)]
-    assert not split(batch(one), one, 0.5).any()
     fitted = fit_judged(model(), one, FittingSettings(patience=2, held_out=0.5), np.random.default_rng(0))
     assert "accuracy_held_out" not in fitted.metrics
     assert len(fitted.predicted) == 0
@@ -128,7 +101,7 @@ def test_the_same_judgements_and_seed_give_the_same_bytes(judged: list[Judged[Se
 def test_nothing_to_learn_from_is_said(make_query: Callable[..., Query[Segment]], preference: float | None) -> None:
     queries = [make_query() for _ in range(3)]
     judged = [] if preference is None else [Judged(q, Comparison(q.id, preference)) for q in queries]
-    with pytest.raises(NothingToFit, match="no judgements" if preference is None else "3 comparisons are ties"):
+    with pytest.raises(NothingToFit, match="no judgements" if preference is None else "3 judgements are ties"):
         fit_judged(model(), judged, FittingSettings(), np.random.default_rng(0))
 
 
@@ -185,9 +158,159 @@ def test_a_confident_prediction_that_is_right_has_a_finite_loss(judged: list[Jud
         def parameters(self) -> list[torch.nn.Parameter]:
             return [self._shift]
 
-        def settle(self, stacked: Any) -> None:
-            """Nothing to settle."""
+        def settle(self, stacked: Any, loss: Any) -> torch.Tensor:
+            return self.scores(stacked).detach()
+
+        def calibrate(self, temperature: float) -> None:
+            """Nothing to calibrate."""
 
     reward: Any = Sure()
     fitted = fit_judged(reward, judged, FittingSettings(epochs=1), np.random.default_rng(0))
     assert fitted.metrics["loss"] == fitted.metrics["loss_held_out"] == pytest.approx(0, abs=1e-6)
+
+
+class Table:
+    """A score of its own for each candidate: the likelihood alone decides."""
+
+    fitted = False
+
+    def __init__(self, members: int = 1) -> None:
+        self.members, self._scores = members, torch.nn.Parameter(torch.zeros(members, 0))
+
+    def stack(self, candidates: Any) -> dict[str, torch.Tensor]:
+        self._scores = torch.nn.Parameter(torch.zeros(self.members, len(candidates)))
+        return {"at": torch.arange(len(candidates))}
+
+    def scores(self, stacked: dict[str, torch.Tensor]) -> torch.Tensor:
+        return self._scores[:, stacked["at"]]
+
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return [self._scores]
+
+    def settle(self, stacked: Any, loss: Any) -> torch.Tensor:
+        return self.scores(stacked).detach()
+
+    def calibrate(self, temperature: float) -> None:
+        """Nothing to calibrate."""
+
+
+MLE = FittingSettings(epochs=3000, learning_rate=0.02, batch_size=10_000, held_out=0.0, max_grad_norm=1e9)
+WORTH = np.array([0.0, 0.8, -0.5, 1.2, 0.3])
+
+
+@pytest.fixture
+def items(make_segment: Callable[..., Segment]) -> list[Segment]:
+    return sorted((make_segment() for _ in WORTH), key=lambda c: c.id)
+
+
+def outcomes(items: list[Segment], worth: Any, rng: np.random.Generator, tie: float, wrong: float) -> Any:
+    """A comparison of each two items under Davidson's model with nu = `tie`, some of them wrong."""
+    for i in range(len(items)):
+        for j in range(i + 1, len(items)):
+            query = Query((items[i], items[j]))
+            a, b = np.exp(worth[i]), np.exp(worth[j])
+            p = np.array([a, b, tie * np.sqrt(a * b)])
+            drawn = rng.choice(3, p=p / p.sum())
+            if rng.random() < wrong:
+                drawn = rng.choice([k for k in range(3 if tie else 2) if k != drawn])
+            yield Judged(query, Comparison(query.id, [1.0, 0.0, 0.5][drawn]))
+
+
+def test_how_readily_ties_are_called_is_learned_beside_the_reward(items: list[Segment]) -> None:
+    rng = np.random.default_rng(0)
+    judged = [one for _ in range(150) for one in outcomes(items, WORTH, rng, tie=0.7, wrong=0.0)]
+    reward: Any = Table()
+    fitted = fit_judged(reward, judged, MLE.model_copy(update={"ties": "davidson", "epochs": 400}), rng)
+    assert fitted.metrics["tie"] == pytest.approx(0.7, rel=0.15)
+    found = reward.scores({"at": torch.arange(5)})[0].detach().numpy()
+    np.testing.assert_allclose(found - found.mean(), WORTH - WORTH.mean(), atol=0.25)
+
+
+@pytest.mark.parametrize(("ties", "tie"), [("half", 0.0), ("davidson", 0.7)])
+def test_error_rates_of_labelers_are_learned_beside_the_reward(items: list[Segment], ties: str, tie: float) -> None:
+    rng, rates = np.random.default_rng(0), {"good": 0.02, "blind": 0.5 if tie == 0.0 else 2 / 3, "hostile": 0.95}
+    judged = []
+    for name, wrong in rates.items():
+        for _ in range(80 if name == "good" else 40):
+            judged += [
+                Judged(one.query, replace(one.judgement, labeler=name))
+                for one in outcomes(items, 3 * WORTH, rng, tie, wrong)
+            ]
+    settings = MLE.model_copy(update={"ties": ties, "reliability": "learned", "epochs": 400})
+    reward: Any = Table()
+    fitted = fit_judged(reward, judged, settings, rng)
+    for name, wrong in rates.items():
+        assert fitted.metrics[f"error_rate/{name}"] == pytest.approx(wrong, abs=0.1)
+
+
+def test_ratings_and_comparisons_are_fitted_on_one_reward(make_segment: Callable[..., Segment]) -> None:
+    pool = [make_segment() for _ in range(240)]
+    cuts = np.quantile([planted(s) for s in pool], [0.25, 0.5, 0.75])
+    judged: list[Judged[Segment]] = []
+    for i in range(0, 240, 3):
+        three = Query(tuple(pool[i : i + 3]))
+        worth = np.array([planted(c) for c in three.candidates])
+        ranks = tuple(int(r) for r in np.argsort(np.argsort(-worth)))
+        kinds = (
+            Rating(three.id, tuple(int(x) for x in np.searchsorted(cuts, worth)), 4),
+            Ranking(three.id, ranks),
+            Choice(three.id, int(worth.argmax())),
+        )
+        judged.append(Judged(three, kinds[(i // 3) % 3]))
+    reward = model()
+    fitted = fit_judged(reward, judged, FittingSettings(epochs=60), np.random.default_rng(0))
+    assert fitted.metrics["accuracy_held_out"] > 0.75
+    fresh = [make_segment() for _ in range(200)]
+    assert pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic > 0.9
+
+
+def test_adaptive_weight_decay_keeps_overfitting_within_bounds(judged: list[Judged[Segment]]) -> None:
+    def ratio(weight_decay: Any) -> float:
+        settings = FittingSettings(epochs=150, learning_rate=3e-3, held_out=0.3, weight_decay=weight_decay)
+        metrics = fit_judged(model(1), judged[:150], settings, np.random.default_rng(0)).metrics
+        return metrics["loss_held_out"] / metrics["loss"]
+
+    assert ratio(0.0) > 2.0
+    assert 1.0 < ratio("adaptive") < 1.7
+
+
+@pytest.mark.parametrize("denoise", ["filter", "flip"])
+def test_wrong_labels_harm_less_when_improbable_ones_are_filtered(
+    judged: list[Judged[Segment]], make_segment: Callable[..., Segment], denoise: Any
+) -> None:
+    rng = np.random.default_rng(0)
+    noisy = [
+        Judged(j.query, Comparison(j.query.id, 1 - j.judgement.preference)) if rng.random() < 0.25 else j  # type: ignore[union-attr]
+        for j in judged
+    ]
+    fresh = [make_segment() for _ in range(300)]
+
+    def recovered(**settings: Any) -> float:
+        reward = model(1)
+        fit_judged(reward, noisy, FittingSettings(epochs=60, **settings), np.random.default_rng(0))
+        return float(pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic)
+
+    assert recovered(denoise=denoise) > recovered() + 0.02
+
+
+def test_pairs_nobody_judged_add_to_a_few_that_were(
+    judged: list[Judged[Segment]], make_segment: Callable[..., Segment]
+) -> None:
+    few, others = judged[:40], [make_segment() for _ in range(300)]
+    fresh = [make_segment() for _ in range(300)]
+
+    def recovered(**settings: Any) -> float:
+        reward = model()
+        fitting = FittingSettings(epochs=80, held_out=0.0, weight_decay=0.1, **settings)
+        fit_judged(reward, few, fitting, np.random.default_rng(0), others)
+        return float(pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic)
+
+    assert recovered(pseudo_labels=1.0, confidence=0.9, crop=0.2) > recovered() - 0.02
+
+
+def test_a_model_that_is_solved_for_needs_no_epochs(judged: list[Judged[Segment]]) -> None:
+    settings: Any = settings_class("rewards", "linear")
+    reward = settings(members=4).build(Task(), np.random.default_rng(0))
+    fitted = fit_judged(reward, judged, FittingSettings(ties="davidson"), np.random.default_rng(0))
+    assert fitted.metrics["epochs"] == 0
+    assert fitted.metrics["accuracy_held_out"] > 0.9

@@ -1,0 +1,222 @@
+"""Descend a likelihood: gradient steps in minibatches, or a closed form, with what is learned beside the reward."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from prefrl.fit import semi
+from prefrl.fit.likelihood import Likelihood, per_judgement, weights
+from prefrl.fit.losses import weighted_mean
+from prefrl.fit.noise import Discriminator, flipped
+from prefrl.fit.settings import FittingSettings
+from prefrl.fit.terms import Terms
+from prefrl.protocols import RewardModel
+from prefrl.seeding import draw_seed
+from prefrl.types import C
+
+RATE = 0.05
+"""Learning rate of what is learned beside the reward: a handful of numbers."""
+UNJUDGED = 4
+"""Pairs nobody judged for each judgement in a gradient step, as in SURF."""
+OVERFIT = (1.1, 1.5)
+"""Where adaptive weight decay keeps the held-out over the training loss (Christiano et al. 2017, section 2.2.3)."""
+DECAY, DECAY_STEP, DECAY_BOUNDS = 0.01, 1.5, (1e-4, 100.0)
+"""Where it begins, its factor from epoch to epoch, and how far it goes."""
+ALTERNATIONS = 10
+"""Turns between a reward that is solved for and what is learned beside it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(Generic[C]):
+    """One fit: what is fitted, on what, and how."""
+
+    reward: RewardModel[C]
+    candidates: Sequence[C]
+    """Those that were judged, and then those that nobody judged."""
+    judged: int
+    """How many were."""
+    stacked: Mapping[str, Tensor]
+    every: Terms
+    """Of all judgements; those that are trained on and those that are held out follow."""
+    train: Terms
+    test: Terms
+    likelihood: Likelihood
+    weight: Tensor
+    """(E, J): how much each training judgement counts for each member."""
+    fitting: FittingSettings
+
+    def loss(self, part: Terms, weight: Tensor, order: torch.Generator) -> Tensor:
+        """The loss of some training judgements; each candidate among them is scored once."""
+        fitting, extra = self.fitting, self._unjudged(part, order)
+        mentioned = torch.cat([part.candidates(), extra.flatten()])
+        needed, here = torch.unique(mentioned, return_inverse=True)
+        stacked: Mapping[str, Tensor] = {name: x[needed] for name, x in self.stacked.items()}
+        scores = self.reward.scores(semi.crop(stacked, fitting.crop, order) if fitting.crop else stacked)
+        loss = weighted_mean(self.likelihood.losses(part.over(here), scores), weights(part, weight))
+        if fitting.reliability == "learned":
+            loss = loss + self.likelihood.prior().sum() / float(self.weight[0].sum())
+        if fitting.centre:
+            loss = loss + fitting.centre * scores.mean(1).square().sum()
+        if len(extra):
+            edges = here[len(mentioned) - extra.numel() :].view(-1, 2)
+            loss = loss + fitting.pseudo_labels * semi.pseudo_loss(scores, edges, fitting.confidence)
+        return loss
+
+    def total(self, scores: Tensor) -> Tensor:
+        """(E, N) scores -> (E,) the negative log-likelihood of all training judgements."""
+        return (self.likelihood.losses(self.train, scores) * weights(self.train, self.weight)).sum(1)
+
+    def _unjudged(self, part: Terms, order: torch.Generator) -> Tensor:
+        if not self.fitting.pseudo_labels:
+            return torch.zeros(0, 2, dtype=torch.int64)
+        count = UNJUDGED * len(part.choices.judgement)
+        return semi.pairs(self.candidates[self.judged :], self.judged, count, order)
+
+
+def optimise(problem: Problem[C], rng: np.random.Generator) -> int:
+    """Descend; returns the epochs run. A reward without parameters is solved for when it settles: 0 epochs."""
+    if trainable(problem.reward):
+        return _Descent(problem, rng).run()
+    _alternate(problem)
+    return 0
+
+
+class _Descent(Generic[C]):
+    """Gradient steps until the epochs are over or patience is."""
+
+    def __init__(self, problem: Problem[C], rng: np.random.Generator) -> None:
+        self.problem: Problem[C] = problem
+        self.fitting = problem.fitting
+        self.parameters = trainable(problem.reward)
+        adaptive = self.fitting.weight_decay == "adaptive"
+        groups: list[dict[str, Any]] = [
+            {"params": self.parameters, "weight_decay": DECAY if adaptive else self.fitting.weight_decay},
+            {"params": problem.likelihood.parameters(), "lr": RATE, "weight_decay": 0.0},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, self.fitting.learning_rate, fused=True)
+        self.order = torch.Generator().manual_seed(draw_seed(rng))
+        self.discriminator = Discriminator()
+
+    def run(self) -> int:
+        """Returns the epochs run."""
+        measured = bool(len(self.problem.test.labeler))
+        patience = self.fitting.patience if measured else 0
+        best, epoch, best_epoch = float("inf"), 0, 0
+        kept = self._copies()
+        while epoch < self.fitting.epochs and (not patience or epoch - best_epoch < patience):
+            epoch += 1
+            self._epoch()
+            if measured and self.fitting.weight_decay == "adaptive":
+                self._adapt()
+            if patience and (loss := ensemble_loss(self.problem, self.problem.test)) < best:
+                best, kept, best_epoch = loss, self._copies(), epoch
+        if patience:
+            torch._foreach_copy_([p.data for p in self._all()], kept)
+        return epoch
+
+    def _epoch(self) -> None:
+        train, weight = self._trusted()
+        order = torch.randperm(len(train.labeler), generator=self.order)
+        for part in train.minibatches(order, self.fitting.batch_size):
+            self._step(self.problem.loss(part, weight, self.order))
+
+    def _trusted(self) -> tuple[Terms, Tensor]:
+        """The training judgements, and the weight of each, after improbable ones were filtered or turned round."""
+        problem = self.problem
+        if self.fitting.denoise == "off":
+            return problem.train, problem.weight
+        sums, counts = per_judgement(problem.train, ensemble_losses(problem, problem.train)[None])
+        pairs = torch.tensor(self.fitting.denoise == "flip") & _is_pair(problem.train, counts)
+        verdict, self.discriminator = self.discriminator.judge(sums[0] / counts, pairs)
+        return flipped(problem.train, verdict.flip), problem.weight * verdict.keep
+
+    def _step(self, loss: Tensor) -> None:
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.fitting.max_grad_norm)
+        if not norm.isfinite():
+            raise FloatingPointError(
+                f"the gradient of the reward model's loss is {float(norm)}, and the loss {float(loss.detach())}: "
+                "lower fitting.learning_rate"
+            )
+        self.optimizer.step()
+
+    def _adapt(self) -> None:
+        """More weight decay where the held-out loss is far above the training loss, less where it is near."""
+        ratio = ensemble_loss(self.problem, self.problem.test) / ensemble_loss(self.problem, self.problem.train)
+        factor = DECAY_STEP if ratio > OVERFIT[1] else 1 / DECAY_STEP if ratio < OVERFIT[0] else 1.0
+        group, (least, most) = self.optimizer.param_groups[0], DECAY_BOUNDS
+        group["weight_decay"] = min(max(group["weight_decay"] * factor, least), most)
+
+    def _all(self) -> list[Tensor]:
+        return [*self.parameters, *self.problem.likelihood.parameters()]
+
+    def _copies(self) -> list[Tensor]:
+        return [p.detach().clone() for p in self._all()]
+
+
+def _alternate(problem: Problem[C]) -> None:
+    """Turn by turn the reward solves for itself, and what is learned beside it descends. Leaves the reward alone."""
+    own, before = problem.likelihood.parameters(), problem.reward.state()
+    for _ in range(ALTERNATIONS if own else 0):
+        scores = problem.reward.settle(problem.stacked, problem.total)
+        _minimise(partial(_own_loss, problem, scores), own)
+        problem.reward.load(before)
+
+
+def _own_loss(problem: Problem[C], scores: Tensor) -> Tensor:
+    return (problem.total(scores) + problem.likelihood.prior()).sum()
+
+
+def trainable(reward: RewardModel[C]) -> list[torch.nn.Parameter]:
+    """What gradient steps change; empty for a reward that is solved for."""
+    return [p for p in reward.parameters() if p.requires_grad]
+
+
+def _minimise(loss: Callable[[], Tensor], parameters: list[Tensor]) -> None:
+    optimizer = torch.optim.LBFGS(parameters, max_iter=50, line_search_fn="strong_wolfe")
+
+    def closure() -> float:
+        optimizer.zero_grad()
+        value = loss()
+        value.backward()  # type: ignore[no-untyped-call]
+        return float(value.detach())
+
+    optimizer.step(closure)  # type: ignore[no-untyped-call]
+
+
+@torch.no_grad()
+def all_scores(reward: RewardModel[C], stacked: Mapping[str, Tensor], chunk: int = 256) -> Tensor:
+    """(E, N) raw scores of everything stacked, a chunk at a time."""
+    count = len(next(iter(stacked.values())))
+    parts = [reward.scores({k: x[i : i + chunk] for k, x in stacked.items()}) for i in range(0, count, chunk)]
+    return torch.cat(parts, 1)
+
+
+@torch.no_grad()
+def ensemble_losses(problem: Problem[C], part: Terms, scores: Tensor | None = None) -> Tensor:
+    """(S + R,) -log of the members' mean likelihood of each term."""
+    found = all_scores(problem.reward, problem.stacked) if scores is None else scores
+    losses = problem.likelihood.losses(part, found)
+    return math.log(len(losses)) - (-losses).logsumexp(0)
+
+
+def ensemble_loss(problem: Problem[C], part: Terms, scores: Tensor | None = None) -> float:
+    """The weighted mean of `ensemble_losses`."""
+    weight = torch.cat([part.choices.weight, part.ratings.weight])
+    return float((ensemble_losses(problem, part, scores) * weight).sum() / weight.sum())
+
+
+def _is_pair(part: Terms, terms: Tensor) -> Tensor:
+    """(J,) whether a judgement is a single comparison of two."""
+    two = torch.zeros(len(terms), dtype=torch.bool)
+    two[part.choices.judgement[part.choices.present.sum(1) == 2]] = True
+    return two & (terms == 1)

@@ -1,0 +1,115 @@
+"""How probable judgements are, given scores: the losses put together, with what is learned beside the reward."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from prefrl.fit import losses
+from prefrl.fit.terms import Choices, Ratings, Terms, Ties
+from prefrl.types import Floats, Metrics
+
+Reliability: TypeAlias = Literal["alike", "learned"]
+START = 0.1
+"""The error rate that a labeler is taken to have before anything is learned; below chance, or signs could turn."""
+PRIOR = 1.0
+"""Judgements without an error, and with one, that each labeler is taken to have given before (a beta prior)."""
+
+
+class Likelihood:
+    """One likelihood over judgements of every kind, on one reward for each member.
+
+    Beside the scores it has parameters of its own, for each member apart: how readily labelers call a tie, where a
+    rating scale's levels begin, and how often each labeler errs. They start anew with every fit.
+    """
+
+    def __init__(self, members: int, terms: Terms, ties: Ties, error_rate: float, reliability: Reliability) -> None:
+        self._ties, self._error_rate, self._labelers = ties, error_rate, terms.labelers
+        self.tie = torch.zeros(members, requires_grad=bool(ties != "half" and terms.choices.tied.any()))
+        self.first_threshold = torch.full((members, 1), -1.0, requires_grad=terms.scale > 0)
+        self.gaps = torch.zeros(members, max(terms.scale - 2, 0), requires_grad=terms.scale > 2)
+        start = math.log(START / (1 - START))
+        self.errors = torch.full((members, len(terms.labelers)), start, requires_grad=reliability == "learned")
+
+    def parameters(self) -> list[Tensor]:
+        """What is learned beside the reward; empty where judgements need nothing."""
+        return [p for p in (self.tie, self.first_threshold, self.gaps, self.errors) if p.requires_grad]
+
+    def losses(self, terms: Terms, scores: Tensor) -> Tensor:
+        """(E, S + R) negative log-likelihoods of all choices, then all ratings, from (E, N) scores."""
+        chosen = self._choices(terms.choices, scores, terms.labeler)
+        if not len(terms.ratings.items):
+            return chosen
+        return torch.cat([chosen, self._ratings(terms.ratings, scores, terms.labeler)], 1)
+
+    def prior(self) -> Tensor:
+        """(E,) negative log-density of the learned error rates' prior, in judgements' worth of nats."""
+        if not self.errors.requires_grad:
+            return torch.zeros(len(self.errors))
+        both = torch.nn.functional.logsigmoid(self.errors) + torch.nn.functional.logsigmoid(-self.errors)
+        return -PRIOR * both.sum(1)
+
+    def metrics(self) -> Metrics:
+        """What was learned beside the reward, as means over members."""
+        found = {}
+        if self.tie.requires_grad:
+            natural = torch.nn.functional.softplus if self._ties == "rao_kupper" else torch.exp
+            found["tie"] = float(natural(self.tie.detach()).mean())
+        if self.errors.requires_grad:
+            rates = self.errors.detach().sigmoid().mean(0).tolist()
+            found |= {f"error_rate/{name}": rate for name, rate in zip(self._labelers, rates, strict=True)}
+        return found
+
+    def pair_errors(self, terms: Terms) -> Floats:
+        """(J,) the probability, in the members' mean, that a judgement of two is not what the scores say."""
+        rates = (
+            self.errors.detach().sigmoid()
+            if self.errors.requires_grad
+            else torch.full_like(self.errors, self._error_rate / 2)
+        )
+        found: Floats = rates.mean(0)[terms.labeler].double().numpy()
+        return found
+
+    def thresholds(self) -> Tensor:
+        """(E, levels - 1), increasing."""
+        return torch.cat([self.first_threshold, self.first_threshold + self.gaps.exp().cumsum(1)], 1)
+
+    def _choices(self, rows: Choices, scores: Tensor, labeler: Tensor) -> Tensor:
+        found = scores[:, rows.items]
+        if not rows.pairs:
+            found = found.masked_fill(~rows.present, -torch.inf)
+        error = self._error(labeler[rows.judgement], rows.present.sum(1))
+        if self._ties == "half":
+            return losses.choice(found, rows.target, error)
+        of_ties = losses.davidson if self._ties == "davidson" else losses.rao_kupper
+        return of_ties(found, rows.target, rows.tied, self.tie, error)
+
+    def _ratings(self, rows: Ratings, scores: Tensor, labeler: Tensor) -> Tensor:
+        levels = torch.tensor(self.thresholds().shape[1] + 1)
+        error = self._error(labeler[rows.judgement], levels)
+        return losses.rating(scores[:, rows.items], rows.level, self.thresholds(), error)
+
+    def _error(self, labeler: Tensor, outcomes: Tensor) -> Tensor | float:
+        """(E, rows, 1) how often each answer is wrong; a share of blind answers hits the right one now and then."""
+        if self.errors.requires_grad:
+            return self.errors.sigmoid()[:, labeler]
+        if self._error_rate == 0.0:
+            return 0.0
+        blind: Tensor = self._error_rate * (outcomes - 1) / outcomes
+        return blind.expand(1, *labeler.shape)
+
+
+def weights(terms: Terms, of_judgement: Tensor) -> Tensor:
+    """(E, S + R) how much each term counts, from the weight (E, J) of each judgement."""
+    parts = (terms.choices, terms.ratings)
+    return torch.cat([part.weight * of_judgement[:, part.judgement] for part in parts], 1)
+
+
+def per_judgement(terms: Terms, values: Tensor) -> tuple[Tensor, Tensor]:
+    """(E, S + R) values -> (E, J) sums of the terms of each judgement, and (J,) how many terms there are."""
+    at = torch.cat([terms.choices.judgement, terms.ratings.judgement])
+    sums = torch.zeros(len(values), len(terms.labeler)).index_add(1, at, values)
+    return sums, at.bincount(minlength=len(terms.labeler))

@@ -1,0 +1,50 @@
+"""How a reward model is fitted."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from prefrl.components import Settings
+from prefrl.fit.likelihood import Reliability
+from prefrl.fit.terms import Rankings, Ties
+
+
+class FittingSettings(Settings):
+    """How a reward model is fitted. Each fit continues from the last one's weights, on all judgements so far."""
+
+    epochs: int = Field(20, ge=1)
+    """The most passes over the training judgements."""
+    patience: int = Field(0, ge=0)
+    """Stop after so many epochs without a better held-out loss, and go back to the best; 0 runs all epochs."""
+    batch_size: int = Field(64, ge=1)
+    """Judgements in a gradient step."""
+    learning_rate: float = Field(1e-3, gt=0)
+    """AdamW's; it starts anew with every fit."""
+    weight_decay: Annotated[float, Field(ge=0)] | Literal["adaptive"] = 0.0
+    """AdamW's decoupled weight decay; `adaptive` keeps the held-out loss at 1.1 to 1.5 times the training loss."""
+    rankings: Rankings = "plackett_luce"
+    """How rankings of more than two count: choice after choice, or as all the pairs that they imply."""
+    ties: Ties = "half"
+    """A tie is half a win for each side, or an outcome of its own whose frequency is learned."""
+    error_rate: float = Field(0.0, ge=0, lt=1)
+    """The assumed probability that an answer is drawn blindly."""
+    reliability: Reliability = "alike"
+    """`learned` estimates how often each labeler errs, together with the reward; `error_rate` is then not used."""
+    denoise: Literal["off", "filter", "flip"] = "off"
+    """Leave out judgements that the model finds improbable, and turn round those it finds all but impossible (RIME)."""
+    held_out: float = Field(0.15, ge=0, lt=1)
+    """The share of judgements that is never trained on, and measures accuracy and calibration."""
+    bootstrap: bool = True
+    """Give each member of an ensemble its own resampling of the training judgements."""
+    max_grad_norm: float = Field(1.0, gt=0)
+    """A gradient that is longer is shortened to this."""
+    centre: float = Field(0.0, ge=0)
+    """Weight of the squared mean of scores, which a likelihood of preferences leaves free to drift."""
+    pseudo_labels: float = Field(0.0, ge=0)
+    """Weight of pairs nobody judged, labelled by the model itself where it is sure (SURF)."""
+    confidence: float = Field(0.99, gt=0.5, lt=1)
+    """How sure it must be."""
+    crop: float = Field(0.0, ge=0, lt=1)
+    """The most of a segment that is cut away at random in each gradient step (SURF); 0 for none."""

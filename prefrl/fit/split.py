@@ -1,0 +1,50 @@
+"""Which judgements are held out of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from prefrl.graph import implied_pairs
+from prefrl.types import C, Judged, Rating
+
+
+def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:
+    """(J,) bool: which judgements are held out. Those that share a candidate, also by way of others, stay together.
+
+    The choice hangs on the id of a component's oldest query alone: it stays the same when judgements are added, so
+    what was held out once is not trained on later, unless a new judgement joins two components of which the older one
+    is trained on. Nothing is held out where that would leave nothing to train on.
+    """
+    component = _components(judged)
+    _, first = np.unique(component, return_index=True)
+    chosen = [component[i] for i in first if int(judged[i].query.id[:8], 16) < share * 2**32]
+    held_out = np.isin(component, chosen)
+    rest = [one for one, out in zip(judged, held_out, strict=True) if not out]
+    return held_out if prefers(rest) else np.zeros(len(judged), bool)
+
+
+def prefers(judged: Sequence[Judged[C]]) -> bool:
+    """Whether anything is preferred to anything; ties alone teach nothing."""
+    levels = {level for one in judged if isinstance(one.judgement, Rating) for level in one.judgement.levels}
+    return len(levels) > 1 or any(
+        preference != 0.5
+        for one in judged
+        if not isinstance(one.judgement, Rating)
+        for _, _, preference in implied_pairs(one.judgement, len(one.query.candidates))
+    )
+
+
+def _components(judged: Sequence[Judged[C]]) -> npt.NDArray[np.integer]:
+    """(J,) which connected component of the graph of candidates each judgement lies in."""
+    index: dict[str, int] = {}
+    at = [[index.setdefault(c.id, len(index)) for c in one.query.candidates] for one in judged]
+    links = [(row[0], other) for row in at for other in row]
+    first, second = zip(*links, strict=True)
+    graph = coo_array((np.ones(len(links)), (first, second)), shape=(len(index), len(index)))
+    _, component = connected_components(graph, directed=False)
+    return np.asarray(component[[row[0] for row in at]])
