@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +12,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
+from gymnasium.wrappers import FlattenObservation
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings, missing, suggest
@@ -30,7 +32,7 @@ class ControlSettings(Settings):
 
     kind: Literal["control"] = "control"
     env: str = "Pendulum-v1"
-    """A registered gymnasium id."""
+    """A registered gymnasium id. Pictures as observations, height by width by channels, are flattened."""
     horizon: int | None = Field(None, gt=0)
     """Steps of an episode; the environment's own limit when left out."""
     segment_seconds: float | None = Field(None, gt=0)
@@ -49,12 +51,14 @@ class ControlSettings(Settings):
         single, probe = self._make()
         horizon, fps = self._horizon(), self._fps(probe)
         observation, action = _observation_box(probe), _action_space(probe)
+        if len(observation.shape) > 1:
+            single = partial(_flat, single)
         probe.close()
         return GymnasiumTask(
             name=self.env,
             horizon=horizon,
             segment_steps=self._segment_steps(horizon, fps),
-            observation_size=observation.shape[0],
+            observation_size=math.prod(observation.shape),
             action_size=int(action.n) if isinstance(action, Discrete) else action.shape[0],
             action_bounds=None if isinstance(action, Discrete) else _bounds(action),
             fps=fps or 30.0,
@@ -157,10 +161,20 @@ def _nearest(name: str) -> str:
 
 
 def _observation_box(env: gymnasium.Env[Any, Any]) -> Box:
+    """Numbers in a row, or a picture (height, width, channels), which is taken apart row by row."""
     space = env.observation_space
-    if not isinstance(space, Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
-        raise ConfigError(f"task.env: observations must be a flat Box of floats, got {space}; wrap and register it so")
-    return space
+    row = isinstance(space, Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
+    picture = isinstance(space, Box) and len(space.shape) == 3 and space.dtype in (np.uint8, np.float32, np.float64)
+    if not (row or picture):
+        raise ConfigError(
+            "task.env: observations must be a flat Box of floats, or a Box of pictures (height, width, channels), got "
+            f"{space}; wrap and register it so"
+        )
+    return space  # type: ignore[return-value]
+
+
+def _flat(make: Callable[[], gymnasium.Env[Any, Any]]) -> gymnasium.Env[Any, Any]:
+    return FlattenObservation(make())
 
 
 def _action_space(env: gymnasium.Env[Any, Any]) -> Box | Discrete:

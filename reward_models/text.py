@@ -1,19 +1,22 @@
-"""A transformer that scores responses: the starting policy's backbone with E linear heads on the last real token."""
+"""A transformer that scores responses: one backbone with E linear heads on the last real token."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Literal, Self
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
-from transformers import PreTrainedTokenizerBase
+from torch.nn.functional import linear
 
 from prefrl.components import ConfigError, Settings
 from prefrl.protocols import Task, TextTask
+from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
+from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.seeding import draw_seed
 from prefrl.types import Floats, Response, State
 
@@ -22,37 +25,69 @@ CHUNK = 128
 
 
 class TransformerSettings(Settings):
-    """The task's starting policy as a backbone, with E linear heads evaluated in one pass."""
+    """A transformer, the task's starting policy or your own, with E linear heads evaluated in one pass."""
 
     kind: Literal["transformer"] = "transformer"
+    backbone: str = ""
+    """A folder, or a name, that transformers can load; the task's starting policy when not given."""
+    checkpoint: str = ""
+    """A sequence classifier with one label, by folder or name: its backbone and its head are where the model starts."""
+    download: bool = False
+    """Whether a name may be looked up on the Hugging Face Hub; otherwise only local files are read."""
     members: int = Field(3, ge=1)
     """E: how many heads, each from its own random start, on one shared backbone."""
-    train: Literal["full", "head"] = "full"
-    """What a fit changes: everything, or the heads alone."""
+    combine: Ensemble = Ensemble()
+    """How the members' scores become the reward."""
+    train: Train = "full"
+    """What a fit changes: everything, low-rank adapters and the heads (LoRA), or the heads alone."""
+    lora_rank: int = Field(16, ge=1)
+    """The rank of the adapters."""
+    lora_targets: Literal["all-linear", "default"] = "all-linear"
+    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
+    pool: Literal["mean", "first"] = "mean"
+    """What the heads see of an encoder: the mean over tokens, or the first. Of a causal model it is always the last."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the backbone's products; weights, heads and scores are always float32."""
+
+    @model_validator(mode="after")
+    def _one_start(self) -> Self:
+        if self.checkpoint and (self.backbone or self.members != 1):
+            raise ValueError("a checkpoint brings a backbone and one head: leave backbone empty and set members to 1")
+        return self
 
     def build(self, task: Task, rng: np.random.Generator) -> TransformerReward:
-        return TransformerReward(self, _text(task), rng)
+        if self.checkpoint:
+            from prefrl.reward_models.io import load_classifier
+
+            return load_classifier(self.checkpoint, _text(task), self, rng)
+        if self.backbone:
+            backbone = of_folder(self.backbone, _text(task), self.download, self.pool)
+        else:
+            backbone = of_policy(_text(task))
+        return TransformerReward(self, backbone, rng)
 
 
 class TransformerReward:
     """A `prefrl.protocols.RewardModel` of responses (Stiennon et al. 2020, section 3.4: a score at the end).
 
-    It reads the tokens as they were sampled, the end token included, so it sees whether a response has ended; rows
-    are padded on the right, where a causal model never looks. Evaluation mode, no dropout, float32. Heads start from
-    N(0, 1 / (d + 1)).
+    It reads the tokens as they were sampled, the end token included, so it sees whether a response has ended; a
+    backbone with another tokenizer reads the text, with an end of its own. Evaluation mode, no dropout. Heads start
+    from N(0, 1 / (d + 1)).
     """
 
-    def __init__(self, settings: TransformerSettings, task: TextTask, rng: np.random.Generator) -> None:
-        self._train = settings.train
-        self._tokenizer = task.tokenizer
-        model = task.model()
-        width = int(model.config.hidden_size)
-        self._backbone: torch.nn.Module = model.base_model.requires_grad_(settings.train == "full")
+    def __init__(self, settings: TransformerSettings, backbone: Backbone, rng: np.random.Generator) -> None:
+        self._settings, self.backbone = settings, backbone
         generator = torch.Generator().manual_seed(draw_seed(rng))
-        heads = torch.randn(settings.members, width, generator=generator) / math.sqrt(width + 1)
+        heads = torch.randn(settings.members, backbone.width, generator=generator) / math.sqrt(backbone.width + 1)
         self._heads, self._bias = torch.nn.Parameter(heads), torch.nn.Parameter(torch.zeros(settings.members))
         self._shift, self._scale = torch.zeros(settings.members), torch.ones(settings.members)
-        self._fitted = False
+        self._fits, self._temperature = 0, 1.0
+        backbone.model.requires_grad_(settings.train == "full")
+        if settings.train == "lora":
+            from prefrl.reward_models.lora import add_adapters  # peft takes seconds to load
+
+            add_adapters(backbone.model, settings.lora_rank, settings.lora_targets, rng)
+        self._trained = trainable(backbone.model, settings.train)
 
     @property
     def members(self) -> int:
@@ -60,73 +95,105 @@ class TransformerReward:
 
     @property
     def fitted(self) -> bool:
-        return self._fitted
+        return self._fits > 0
 
     def parameters(self) -> Iterable[torch.nn.Parameter]:
-        backbone = self._backbone.parameters() if self._train == "full" else ()
-        return [*backbone, self._heads, self._bias]
+        return [*self._trained.values(), self._heads, self._bias]
 
     def stack(self, candidates: Sequence[Response]) -> Mapping[str, Tensor]:
-        """tokens (N, L) and lengths (N,); where only heads are trained, the backbone's features (N, d) at once."""
-        rows = [_ids(c, self._tokenizer) for c in candidates]
-        if self._train == "head":
-            return {"features": self._in_chunks(rows)}
-        return _padded(rows)
+        """tokens (N, L) and lengths (N,); where only heads are trained, the backbone's features (N, d) at once.
+
+        Raises ValueError for a candidate that is longer than the backbone's context.
+        """
+        if self._settings.train == "head":
+            return {"features": self._in_chunks(candidates)}
+        return _padded(self.backbone.rows(candidates))
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         features = stacked["features"] if "features" in stacked else self._features(stacked)
-        return self._heads @ features.T + self._bias[:, None]
+        return linear(features, self._heads, self._bias).T
 
     @torch.no_grad()
-    def settle(self, stacked: Mapping[str, Tensor]) -> None:
+    def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
         count = len(next(iter(stacked.values())))
         parts = [self.scores({k: x[i : i + CHUNK] for k, x in stacked.items()}) for i in range(0, count, CHUNK)]
         scores = torch.cat(parts, 1)
         self._shift, self._scale = scores.mean(1), scores.std(1, correction=0).clamp(min=1e-6)
-        self._fitted = True
+        self._fits, self._temperature = self._fits + 1, 1.0
+        return scores
 
-    @torch.no_grad()
+    def calibrate(self, temperature: float) -> None:
+        self._temperature = temperature
+
     def raw_member_scores(self, candidates: Sequence[Response]) -> Floats:
-        features = self._in_chunks([_ids(c, self._tokenizer) for c in candidates])
-        raw: Floats = self.scores({"features": features}).numpy()
+        raw: Floats = self._scores_of(candidates) / self._temperature
         return raw
 
     def member_scores(self, candidates: Sequence[Response]) -> Floats:
         shift, scale = self._shift.numpy()[:, None], self._scale.numpy()[:, None]
-        found: Floats = (self.raw_member_scores(candidates) - shift) / scale
+        found: Floats = (self._scores_of(candidates) - shift) / scale
         return found
 
     def score(self, candidates: Sequence[Response]) -> Floats:
-        mean: Floats = self.member_scores(candidates).mean(0)
-        return mean
+        return combine(self.member_scores(candidates), self._settings.combine, self._fits)
+
+    def features(self, candidates: Sequence[Response]) -> Floats:
+        """(N, d): what the heads see, the backbone's state at the last token."""
+        found: Floats = self._in_chunks(candidates).numpy()
+        return found
 
     def state(self) -> State:
-        backbone = {name: p.detach().clone() for name, p in self._backbone.named_parameters()}
+        """What a fit changes; of what it does not change, only a digest."""
+        trained = {name: p.detach().clone() for name, p in self._trained.items()}
         heads = {"heads": self._heads.detach().clone(), "bias": self._bias.detach().clone()}
-        return {"backbone": backbone, **heads, "shift": self._shift, "scale": self._scale, "fitted": self._fitted}
+        settled = {"shift": self._shift, "scale": self._scale, "fits": self._fits, "temperature": self._temperature}
+        return {"backbone": trained, "frozen": self._frozen, **heads, **settled}
 
     @torch.no_grad()
     def load(self, state: State) -> None:
-        """Raises ValueError where names or shapes differ."""
-        own = {**dict(self._backbone.named_parameters()), "heads": self._heads, "bias": self._bias}
+        """Raises ValueError where names or shapes differ, or the weights that no fit changes."""
+        own = {**self._trained, "heads": self._heads, "bias": self._bias}
         found = {**state["backbone"], "heads": state["heads"], "bias": state["bias"]}
         if wrong := [n for n, p in own.items() if n not in found or found[n].shape != p.shape]:
             raise ValueError(f"reward model: {wrong[0]} is missing or has another shape: it was made by other settings")
+        if state["frozen"] != self._frozen:
+            raise ValueError("reward model: its backbone's frozen weights are others than those it was fitted on")
         for name, parameter in own.items():
             parameter.copy_(found[name])
         self._shift, self._scale = state["shift"].clone(), state["scale"].clone()
-        self._fitted = bool(state["fitted"])
-
-    def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
-        """(N, d): the backbone's output at each row's last real token. Padding beyond the longest row is cut off."""
-        lengths = stacked["lengths"]
-        tokens = stacked["tokens"][:, : int(lengths.max())]
-        hidden: Tensor = self._backbone(input_ids=tokens, use_cache=False).last_hidden_state
-        return hidden[torch.arange(len(tokens)), lengths - 1]
+        self._fits, self._temperature = int(state["fits"]), float(state["temperature"])
 
     @torch.no_grad()
-    def _in_chunks(self, rows: Sequence[Sequence[int]]) -> Tensor:
+    def start_from(self, weight: Tensor) -> None:
+        """Take over one head (1, d) that was fitted elsewhere, with its scores as they are."""
+        self._heads.copy_(weight)
+        self._fits = 1
+
+    @torch.no_grad()
+    def mean_head(self) -> tuple[Tensor, float]:
+        """The mean of the members' normalised scores is `features @ weight` (d,) plus a constant."""
+        weight = (self._heads / self._scale[:, None]).mean(0)
+        return weight, float(((self._bias - self._shift) / self._scale).mean())
+
+    @cached_property
+    def _frozen(self) -> str:
+        named = dict(self.backbone.model.named_parameters())
+        return digest({n: p for n, p in named.items() if n not in self._trained and "pooler" not in n})
+
+    def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
+        """(N, d) float32."""
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+            return self.backbone.states(stacked["tokens"], stacked["lengths"]).float()
+
+    @torch.no_grad()
+    def _scores_of(self, candidates: Sequence[Response]) -> Floats:
+        found: Floats = self.scores({"features": self._in_chunks(candidates)}).numpy()
+        return found
+
+    @torch.no_grad()
+    def _in_chunks(self, candidates: Sequence[Response]) -> Tensor:
         """(N, d) features, rows of like length together."""
+        rows = self.backbone.rows(candidates)
         order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
         chunks = [order[i : i + CHUNK] for i in range(0, len(rows), CHUNK)]
         features = torch.cat([self._features(_padded([rows[i] for i in chunk])) for chunk in chunks])
@@ -138,14 +205,6 @@ def _padded(rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
     width = max(map(len, rows))
     tokens = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows])
     return {"tokens": tokens, "lengths": torch.tensor([len(row) for row in rows])}
-
-
-def _ids(response: Response, tokenizer: PreTrainedTokenizerBase) -> list[int]:
-    """Prompt and response as sampled; only a response that comes without tokens is encoded, as one that has ended."""
-    prompt = response.prompt_tokens or tokenizer.encode(response.prompt)
-    if response.tokens:
-        return [*prompt, *response.tokens]
-    return [*prompt, *tokenizer.encode(response.text, add_special_tokens=False), int(tokenizer.eos_token_id)]
 
 
 def _text(task: Task) -> TextTask:

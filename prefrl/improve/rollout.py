@@ -49,6 +49,13 @@ class Rollout:
         ends: np.ndarray = self.terminated | self.truncated
         return ends
 
+    @property
+    def begins(self) -> np.ndarray:
+        """(n, T) bool: the first step of an episode, or of the row."""
+        begins: np.ndarray = np.roll(self.ends, 1, 1)
+        begins[:, 0] = True
+        return begins
+
     def state(self) -> State:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
@@ -89,8 +96,11 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
 
 
 def learned_rewards(reward: StepRewardModel, rollout: Rollout) -> Floats:
-    """(n, T) learned rewards, scored in one batch. Raises FloatingPointError where one is not finite."""
-    rewards = reward.rewards(rollout.observations, rollout.actions)
+    """(n, T) learned rewards, scored in one batch. Raises FloatingPointError where one is not finite.
+
+    A reward that looks back sees no step of another episode, nor what came before this rollout.
+    """
+    rewards = reward.rewards(rollout.observations, rollout.actions, rollout.begins)
     bad = np.argwhere(~np.isfinite(rewards))
     if len(bad):
         env, t = bad[0]
@@ -107,9 +117,7 @@ def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
     A window lies inside one episode; the last start is included. The first and last window of an episode weigh as
     much as `length` others: its edges would else be seen `length` times less often than its middle.
     """
-    ends = rollout.ends
-    begins = np.zeros_like(ends)
-    begins[:, 0], begins[:, 1:] = True, ends[:, :-1]
+    ends, begins = rollout.ends, rollout.begins
     episode = begins.cumsum(1)
     last = ends.shape[1] - length
     if last < 0:

@@ -87,7 +87,8 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
     """Any `VecEnv` with a reward model's rewards in place of its own, which are dropped.
 
     Put it inside of whatever normalises observations: a reward model sees them raw. Swap `learned` after a fit; with
-    a replay buffer, `relabel` it too. Raises FloatingPointError where a reward is not finite.
+    a replay buffer, `relabel` it too. A reward that looks back sees the steps of the running episode. Raises
+    FloatingPointError where a reward is not finite.
     """
 
     def __init__(self, venv: VecEnv, reward: StepRewardModel | None) -> None:
@@ -95,9 +96,12 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
         self.learned = reward
         self._observations: Floats = np.zeros(0)
         self._actions: Floats = np.zeros(0)
+        self._recent: list[tuple[Floats, Floats, np.ndarray]] = []
+        self._begins = np.ones(venv.num_envs, bool)
 
     def reset(self) -> Floats:
         self._observations = self.venv.reset()
+        self._recent, self._begins = [], np.ones(self.num_envs, bool)
         return self._observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -106,15 +110,18 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
 
     def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
         observations, _, dones, infos = self.venv.step_wait()
-        rewards = _score(self.learned, self._observations, self._actions)
-        self._observations = observations
+        self._recent.append((self._observations.reshape(self.num_envs, -1), self._actions, self._begins))
+        self._recent = self._recent[-(1 if self.learned is None else self.learned.memory) :]
+        rewards = _score(self.learned, *(np.stack(part, 1) for part in zip(*self._recent, strict=True)))[:, -1]
+        self._observations, self._begins = observations, dones
         return observations, rewards, dones, infos
 
 
 def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
     """Recompute every reward of a replay buffer (Lee et al. 2021, PEBBLE, section 4.2), in place.
 
-    Raises ValueError for buffers that keep something else than one transition a slot.
+    A reward that looks back sees what the buffer still holds of its episode. Raises ValueError for buffers that keep
+    something else than one transition a slot.
     """
     if type(buffer) is not ReplayBuffer:
         raise ValueError(f"relabel needs stable-baselines3's plain ReplayBuffer, got {type(buffer).__name__}")
@@ -124,9 +131,22 @@ def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
     actions = buffer.actions[:size]
     if isinstance(space, gymnasium.spaces.Box):  # the buffer keeps actions scaled to [-1, 1]
         actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
-    flat = executed(space, actions.reshape(size * buffer.n_envs, -1))
-    observations = buffer.observations[:size].reshape(size * buffer.n_envs, -1)
-    buffer.rewards[:size] = _score(reward, observations, flat).reshape(size, buffer.n_envs)
+    flat = executed(space, actions.reshape(size * buffer.n_envs, -1)).reshape(size, buffer.n_envs, -1)
+    observations = buffer.observations[:size].reshape(size, buffer.n_envs, -1)
+    oldest_first = np.roll(np.arange(size), -buffer.pos if buffer.full else 0)
+    parts = (x[oldest_first].swapaxes(0, 1) for x in (observations, flat, _begins(buffer, size)))
+    buffer.rewards[oldest_first] = _score(reward, *parts).T
+
+
+def _begins(buffer: ReplayBuffer, size: int) -> np.ndarray:
+    """(size, n) bool: whether a slot does not go on from the one before it, because of an end or of a reset."""
+    ends = buffer.dones[:size] > 0
+    if not buffer.optimize_memory_usage:  # which would hold no other next observation than the next slot's
+        resets = buffer.next_observations[:size] != np.roll(buffer.observations[:size], -1, 0)
+        ends = ends | resets.reshape(size, buffer.n_envs, -1).any(2)
+    begins: np.ndarray = np.roll(ends, 1, 0)
+    begins[buffer.pos % size if buffer.full else 0] = True
+    return begins
 
 
 def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
@@ -150,15 +170,15 @@ def _infos(step: Transition) -> list[dict[str, Any]]:
     return infos
 
 
-def _score(reward: StepRewardModel | None, observations: Floats, actions: Floats) -> Floats:
-    """(n,) float32 rewards of n single steps."""
+def _score(reward: StepRewardModel | None, observations: Floats, actions: Floats, begins: np.ndarray) -> Floats:
+    """(n, T) float32 rewards of T steps of n environments."""
     if reward is None:
         raise ValueError("LearnedReward has no reward model yet: set its `learned`")
-    rewards = reward.rewards(observations[:, None], actions[:, None])[:, 0]
+    rewards = reward.rewards(observations, actions, begins)
     if not np.isfinite(rewards).all():
-        i = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        i, t = np.argwhere(~np.isfinite(rewards))[0]
         raise FloatingPointError(
-            f"the learned reward of environment {i} is {rewards[i]} at observation {observations[i]}, "
-            f"action {actions[i]}; expected finite rewards: look at the reward model's last fit"
+            f"the learned reward of environment {i} is {rewards[i, t]} at observation {observations[i, t]}, "
+            f"action {actions[i, t]}; expected finite rewards: look at the reward model's last fit"
         )
     return rewards.astype(np.float32)

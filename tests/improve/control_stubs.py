@@ -58,8 +58,9 @@ class Known:
     function: Callable[[Floats, Floats], Floats] = field(default=lambda o, a: 1.0 - 2.0 * np.abs(o[..., 0]))
     members: int = 1
     fitted: bool = True
+    memory: int = 1
 
-    def rewards(self, observations: Floats, actions: Floats) -> Floats:
+    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
         rewards: Floats = self.function(observations, actions).astype(np.float32)
         return rewards
 
@@ -72,7 +73,10 @@ class Known:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return []
 
-    def settle(self, stacked: Mapping[str, torch.Tensor]) -> None: ...
+    def settle(self, stacked: Mapping[str, torch.Tensor], loss: object) -> torch.Tensor:
+        raise NotImplementedError
+
+    def calibrate(self, temperature: float) -> None: ...
 
     def raw_member_scores(self, candidates: Sequence[Segment]) -> Floats:
         return self.member_scores(candidates)
@@ -83,6 +87,9 @@ class Known:
     def score(self, candidates: Sequence[Segment]) -> Floats:
         scores: Floats = self.member_scores(candidates)[0]
         return scores
+
+    def features(self, candidates: Sequence[Segment]) -> Floats:
+        raise NotImplementedError
 
     def state(self) -> State:
         return {}

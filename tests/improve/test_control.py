@@ -183,7 +183,7 @@ def test_it_learns_from_a_fitted_ensemble(store: Store[Segment]) -> None:
     task = point()
     learner = _learner(task)
     reward = MLPSettings(hidden=(8,)).build(task, np.random.default_rng(0))
-    reward.settle(reward.stack(learner.sample(20, np.random.default_rng(0))))
+    reward.settle(reward.stack(learner.sample(20, np.random.default_rng(0))), lambda scores: scores.sum(1))
     metrics = learner.improve(reward, store, np.random.default_rng(1))
     assert all(np.isfinite(v) for v in metrics.values())
     json.dumps(metrics)

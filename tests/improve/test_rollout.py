@@ -21,11 +21,13 @@ from prefrl.improve.rollout import (
     evaluation,
     first_rollout,
     joined,
+    learned_rewards,
     whole_episodes,
     windows,
 )
-from prefrl.reward_models.mlp import MLPReward, MLPSettings
-from prefrl.sample.select import groups
+from prefrl.reward_models.mlp import MLPSettings
+from prefrl.reward_models.steps import StepReward
+from prefrl.sample.queries import groups
 from prefrl.types import Floats
 
 
@@ -54,7 +56,7 @@ def _rollout(steps: int = 17, count: int = 2) -> Rollout:
     return collect(envs, envs.reset(np.random.default_rng(0)), steps, _act)[0]
 
 
-def _model() -> MLPReward:
+def _model() -> StepReward:
     return MLPSettings(hidden=(4,)).build(_task(), np.random.default_rng(0))
 
 
@@ -215,3 +217,17 @@ def test_a_reward_that_is_not_finite_is_an_error_that_names_it_and_the_step() ->
     observations[1, 4] = np.inf
     with pytest.raises(FloatingPointError, match="environment 1, step 4"):
         evaluation(_task(), replace(rollout, observations=observations, truncated=rollout.truncated | True), _model())
+
+
+def test_a_reward_that_looks_back_is_told_where_episodes_begin() -> None:
+    rollout, told = _rollout(), list[Any]()
+
+    class Told:
+        fitted, members, memory = True, 1, 5
+
+        def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+            told.append(begins)
+            return np.zeros(observations.shape[:2], np.float32)
+
+    learned_rewards(Told(), rollout)  # type: ignore[arg-type]
+    assert np.flatnonzero(told[0][0]).tolist() == [0, 7, 14]

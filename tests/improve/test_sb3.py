@@ -18,10 +18,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 from prefrl.checkpoints import load_state, save_state
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
+from prefrl.improve.rollout import learned_rewards
 from prefrl.improve.sb3 import SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
 from prefrl.reward_models.mlp import MLPSettings
+from prefrl.reward_models.sequence import GRUSettings
 from prefrl.store import Store
-from prefrl.types import Segment, Steps
+from prefrl.types import Floats, Segment, Steps
 
 NET = {"net_arch": [8]}
 PPO: dict[str, Any] = {"algorithm": "PPO", "options": {"n_steps": 20, "n_epochs": 2, "batch_size": 40}}
@@ -208,3 +210,55 @@ def test_sac_needs_continuous_actions() -> None:
 
 def test_the_algorithm_is_stable_baselines3s_own() -> None:
     assert isinstance(_learner(point(), SAC_).model, SAC)
+
+
+def _ages(observations: Floats, actions: Floats, begins: np.ndarray | None) -> Floats:
+    """For each step, how many steps of its episode can be seen, itself counted."""
+    seen: Floats = np.zeros(observations.shape[:2])
+    for t in range(observations.shape[1]):
+        before = seen[:, t - 1] if t else 0
+        seen[:, t] = 1 + (before if begins is None else np.where(begins[:, t], 0, before))
+    return seen
+
+
+class Ageing:
+    """A reward model that looks back over `memory` steps, and pays for how many it sees."""
+
+    fitted, members, memory = True, 1, 4
+
+    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+        return np.minimum(_ages(observations, actions, begins), self.memory).astype(np.float32)
+
+
+def test_the_wrapper_shows_a_reward_the_running_episode_as_far_back_as_it_looks() -> None:
+    task = ControlSettings(env="Pendulum-v1", horizon=6, segment_steps=3).build()
+    env, reward = LearnedReward(TaskEnv(task, 2), None), Ageing()
+    env.learned = reward  # type: ignore[assignment]
+    env.reset()
+    found = [env.step(np.zeros((2, 1), np.float32))[1].tolist() for _ in range(9)]
+    assert found == [[float(min(t, 4))] * 2 for t in (1, 2, 3, 4, 5, 6, 1, 2, 3)]
+    env.reset()
+    assert env.step(np.zeros((2, 1), np.float32))[1].tolist() == [1.0, 1.0]
+
+
+def test_the_wrapper_gives_the_rewards_of_the_whole_rollout() -> None:
+    task = ControlSettings(env="Pendulum-v1", horizon=7, segment_steps=3).build()
+    reward = GRUSettings(width=8).build(task, np.random.default_rng(0))
+    inner = TaskEnv(task, 2)
+    env, rng = LearnedReward(inner, reward), np.random.default_rng(1)
+    inner.start(rng)
+    env.reset()
+    found = np.stack([env.step(rng.uniform(-2, 2, (2, 1)).astype(np.float32))[1] for _ in range(17)], 1)
+    np.testing.assert_allclose(found, learned_rewards(reward, inner.rollout()), rtol=1e-4, atol=1e-5)
+
+
+def test_relabelling_follows_the_ring_through_ends_and_resets() -> None:
+    box = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    buffer = ReplayBuffer(8, gymnasium.spaces.Box(-99.0, 99.0, (1,)), box, n_envs=1)
+    place = 0.0
+    for t in range(11):  # the ring is overwritten from its start; slot 2 then holds the newest step
+        observation, done = np.array([[place]], np.float32), t == 5
+        buffer.add(observation, observation + 1, np.zeros((1, 1)), np.zeros(1), np.array([done]), [{}])
+        place = 50.0 if t == 8 else place + 1  # a reset without an end, as between two rounds
+    relabel(buffer, Ageing())  # type: ignore[arg-type]
+    assert buffer.rewards[:, 0].tolist() == [3, 1, 2, 1, 2, 3, 1, 2]

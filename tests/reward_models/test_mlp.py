@@ -11,7 +11,8 @@ import torch
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.protocols import StepRewardModel
-from prefrl.reward_models.mlp import MLPReward, MLPSettings
+from prefrl.reward_models.mlp import MLP, MLPSettings
+from prefrl.reward_models.steps import StepReward
 from prefrl.types import Segment
 
 
@@ -19,8 +20,13 @@ def _task() -> GymnasiumTask:
     return ControlSettings(env="Pendulum-v1", segment_steps=10).build()
 
 
-def _model(members: int = 3, seed: int = 0) -> MLPReward:
+def _model(members: int = 3, seed: int = 0) -> StepReward:
     return MLPSettings(members=members, hidden=(8, 8)).build(_task(), np.random.default_rng(seed))
+
+
+def _settle(model: StepReward, segments: list[Segment], temperature: float = 1.0) -> None:
+    model.settle(model.stack(segments), lambda scores: scores.sum(1))
+    model.calibrate(temperature)
 
 
 def _segments(count: int, lengths: tuple[int, ...] = (10,), seed: int = 1) -> list[Segment]:
@@ -36,7 +42,7 @@ def _segments(count: int, lengths: tuple[int, ...] = (10,), seed: int = 1) -> li
 
 def test_a_score_is_the_sum_of_the_rewards_of_its_steps() -> None:
     model, segments = _model(), _segments(5, (10, 4))
-    model.settle(model.stack(segments))
+    _settle(model, segments)
     sums = [model.rewards(s.observations[None], s.actions[None]).sum() for s in segments]
     np.testing.assert_allclose(model.score(segments), sums, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(model.score(segments), model.member_scores(segments).mean(0), rtol=1e-6)
@@ -46,7 +52,7 @@ def test_raw_scores_are_the_fitted_logits_and_asking_for_them_changes_nothing() 
     model, segments = _model(), _segments(8, (10, 4))
     stacked = model.stack(segments)
     fitted = model.scores(stacked).detach().numpy()
-    model.settle(stacked)
+    model.settle(stacked, lambda scores: scores.sum(1))
     before = {name: torch.as_tensor(value).clone() for name, value in model.state().items()}
     raw = model.raw_member_scores(segments)
     model.raw_member_scores(_segments(3, seed=9))
@@ -65,12 +71,14 @@ def test_padding_changes_nothing() -> None:
 def test_members_evaluated_together_are_the_members_evaluated_alone() -> None:
     model, segments = _model(), _segments(4)
     stacked = model.stack(segments)
-    x = (stacked["inputs"] - model._input_mean) / model._input_std
+    x = stacked["inputs"]
+    network = model.network
+    assert isinstance(network, MLP)
     for e in range(3):
         h = x
-        for w, b in zip(model._weights[:-1], model._biases[:-1], strict=True):
+        for w, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
             h = torch.tanh(h @ w[e] + b[e])
-        alone = (h @ model._weights[-1][e] + model._biases[-1][e])[..., 0].mean(1) * 10.0
+        alone = (h @ network.weights[-1][e] + network.biases[-1][e])[..., 0].mean(1) * 10.0
         torch.testing.assert_close(model.scores(stacked)[e], alone)
 
 
@@ -82,12 +90,11 @@ def test_members_start_different() -> None:
 
 def test_settling_gives_each_member_rewards_of_mean_0_and_std_1() -> None:
     model, segments = _model(), _segments(20, (10, 6))
-    model.settle(model.stack(segments))
-    steps = torch.cat([torch.from_numpy(np.concatenate([s.observations, s.actions], 1)) for s in segments])
-    with torch.no_grad():
-        rewards = model._member_rewards(steps)
-    torch.testing.assert_close(rewards.mean(1), torch.zeros(3), atol=1e-5, rtol=0)
-    torch.testing.assert_close(rewards.std(1, correction=0), torch.ones(3), atol=1e-4, rtol=0)
+    _settle(model, segments)
+    steps = [Segment(s.observations[t : t + 1], s.actions[t : t + 1], "e", t) for s in segments for t in range(len(s))]
+    rewards = model.member_scores(steps)
+    np.testing.assert_allclose(rewards.mean(1), 0, atol=1e-5)
+    np.testing.assert_allclose(rewards.std(1), 1, atol=1e-4)
 
 
 def test_logits_do_not_depend_on_the_usual_length_of_segments() -> None:
@@ -104,7 +111,7 @@ def test_logits_do_not_depend_on_the_usual_length_of_segments() -> None:
 
 def test_a_later_fit_starts_from_the_same_function_though_its_normaliser_moves() -> None:
     model, segments = _model(), _segments(8)
-    model.settle(model.stack(segments))
+    _settle(model, segments)
     before = model.rewards(segments[0].observations[None], segments[0].actions[None])
     mean = model._input_mean
     model.stack([replace(s, observations=s.observations * 3 - 4) for s in segments])
@@ -122,7 +129,7 @@ def test_it_never_sees_gold_states_or_time() -> None:
     assert _model().member_scores(plain).tobytes() == _model().member_scores(other).tobytes()
     models = [_model(), _model()]
     for model, segments in zip(models, (plain, other), strict=True):
-        model.settle(model.stack(segments))
+        _settle(model, segments)
     assert models[0].score(plain).tobytes() == models[1].score(plain).tobytes()
 
 
@@ -134,7 +141,7 @@ def test_same_seed_gives_equal_bytes_and_another_does_not() -> None:
 
 def test_state_and_load_give_the_same_model() -> None:
     model, segments = _model(), _segments(6)
-    model.settle(model.stack(segments))
+    _settle(model, segments)
     other = _model(seed=5)
     before = other.fitted
     other.load(model.state())
@@ -158,6 +165,24 @@ def test_other_shapes_are_refused_by_name() -> None:
     state = MLPSettings(hidden=(4,)).build(_task(), np.random.default_rng(0)).state()
     with pytest.raises(ValueError, match="weight_0 has shape"):
         MLPSettings(hidden=(8,)).build(_task(), np.random.default_rng(0)).load(state)
+
+
+def test_raw_scores_are_divided_by_the_temperature_and_what_learners_get_is_not() -> None:
+    segments, cool, hot = _segments(8), _model(), _model()
+    _settle(cool, segments)
+    _settle(hot, segments, 4.0)
+    np.testing.assert_allclose(hot.raw_member_scores(segments) * 4.0, cool.raw_member_scores(segments), rtol=1e-5)
+    np.testing.assert_array_equal(hot.score(segments), cool.score(segments))
+    again = _model(seed=3)
+    again.load(hot.state())
+    np.testing.assert_array_equal(again.raw_member_scores(segments), hot.raw_member_scores(segments))
+
+
+def test_a_step_that_is_not_finite_spoils_its_own_segment_only() -> None:
+    model, segments = _model(), _segments(4)
+    segments[2].observations[5, 1] = np.nan
+    scores = model.scores(model.stack(segments)).detach()
+    assert scores.isfinite().all(0).tolist() == [True, True, False, True]
 
 
 def test_it_is_a_step_reward_model_and_wants_a_control_task() -> None:

@@ -1,0 +1,99 @@
+"""An ensemble of convolutional networks over (picture, action): a reward for each step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from prefrl.components import ConfigError, Settings
+from prefrl.protocols import ControlTask, Task
+from prefrl.reward_models.ensemble import Ensemble
+from prefrl.reward_models.mlp import MLP
+from prefrl.reward_models.steps import StepReward, control, each_input, uniform
+from prefrl.seeding import draw_seed
+
+
+class CNNSettings(Settings):
+    """An ensemble of convolutional networks over pictures, evaluated in one batched pass (grouped convolutions)."""
+
+    kind: Literal["cnn"] = "cnn"
+    image: tuple[int, int, int]
+    """Height, width and channels of the pictures that observations are; channels come last."""
+    members: int = Field(3, ge=1)
+    """E: how many networks, each from its own random start."""
+    channels: tuple[int, ...] = Field((16, 32), min_length=1)
+    """Filters of the convolutions: 3 x 3, every second pixel, with ReLU."""
+    hidden: tuple[int, ...] = (64,)
+    """Widths of the layers behind them, which also get the action."""
+    brightest: float | None = Field(255.0, gt=0)
+    """Pictures are divided by this; left empty, their mean and std over all pixels are measured in the first fit."""
+    gain: float = Field(10.0, gt=0)
+    """A segment's raw score is this times the mean of its networks' outputs, when it has the task's usual length."""
+    combine: Ensemble = Ensemble()
+    """How the members become the one reward that learners optimise."""
+
+    def build(self, task: Task, rng: np.random.Generator) -> StepReward:
+        """Raises `ConfigError` where the task's observations cannot be such pictures."""
+        found = control(task, self.kind)
+        _check(self.image, found)
+        network = CNN(self, found.action_size, torch.Generator().manual_seed(draw_seed(rng)))
+        return StepReward(network, found, self.gain, self.combine, self.measure)
+
+    def measure(self, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """One mean and std for all pixels; the actions each have their own."""
+        pixels = math.prod(self.image)
+        action_mean, action_std = each_input(steps[:, pixels:])
+        if self.brightest is not None:
+            mean, std = torch.tensor(0.0), torch.tensor(self.brightest)
+        else:
+            std, mean = torch.std_mean(steps[:, :pixels], correction=0)
+        std = std if std > 1e-6 else torch.tensor(1.0)
+        return torch.cat([mean.expand(pixels), action_mean]), torch.cat([std.expand(pixels), action_std])
+
+
+class CNN:
+    """A `Network`: E stacks of convolutions side by side as groups of one, and perceptrons on what they find."""
+
+    memory, first = 1, None
+
+    def __init__(self, settings: CNNSettings, actions: int, generator: torch.Generator) -> None:
+        self.members, self._image = settings.members, settings.image
+        height, width, channels = settings.image
+        pairs = list(pairwise((channels, *settings.channels)))
+        self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, generator) for i, o in pairs]
+        self._biases = [uniform((self.members * o,), 9 * i, generator) for i, o in pairs]
+        halved = (-(-size // 2 ** len(pairs)) for size in (height, width))
+        found = math.prod(halved) * settings.channels[-1]
+        self._head = MLP(self.members, (found + actions, *settings.hidden, 1), "relu", generator)
+
+    def named(self) -> Mapping[str, Tensor]:
+        filters = {f"filter_{i}": w for i, w in enumerate(self._filters)}
+        return {**filters, **{f"filter_bias_{i}": b for i, b in enumerate(self._biases)}, **self._head.named()}
+
+    def outputs(self, inputs: Tensor) -> Tensor:
+        pixels = math.prod(self._image)
+        steps = inputs.flatten(0, 1)
+        x = steps[:, :pixels].reshape(-1, *self._image).permute(0, 3, 1, 2)
+        for i, (weight, bias) in enumerate(zip(self._filters, self._biases, strict=True)):
+            # All members see one picture, so the first layer is one convolution with the filters of all.
+            x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else 1))
+        seen = x.reshape(len(steps), self.members, -1).transpose(0, 1)
+        both = torch.cat([seen, steps[:, pixels:].expand(self.members, -1, -1)], 2)
+        return self._head.of_members(both).view(self.members, *inputs.shape[:2])
+
+
+def _check(image: tuple[int, int, int], task: ControlTask) -> None:
+    if min(image) < 1 or math.prod(image) != task.observation_size:
+        raise ConfigError(
+            f"reward.image: pictures of {' x '.join(map(str, image))} (height, width, channels) have "
+            f"{math.prod(image)} numbers, but the observations of {task.name} have {task.observation_size}; give the "
+            "shape of the environment's own pictures"
+        )

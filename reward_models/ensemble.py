@@ -1,0 +1,38 @@
+"""How the members of an ensemble are put together into the one reward that learners optimise."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from prefrl.components import Settings
+from prefrl.types import Floats
+
+
+class Ensemble(Settings):
+    """What an ensemble of E members answers: their mean, or less where they disagree, and a bonus for disagreement."""
+
+    by: Literal["mean", "lower", "worst"] = "mean"
+    """The mean; `lower`, the mean less `caution` standard deviations; or `worst`, the lowest of the members."""
+    caution: float = Field(1.0, ge=0)
+    """How many standard deviations over members `lower` takes off."""
+    optimism: float = Field(0.0, ge=0)
+    """How many standard deviations over members are added on top, to explore what is not yet known; 0 adds none."""
+    optimism_decay: float = Field(0.1, ge=0, le=1)
+    """By what share the bonus shrinks from each fit to the next."""
+
+
+def combine(values: Floats, settings: Ensemble, fits: int) -> Floats:
+    """(E, ...) values of E members after `fits` fits -> (...).
+
+    The bonus is beta * std with beta = optimism * (1 - decay)^(fits - 1) (RUNE, Liang et al. 2022, who
+    count steps of the policy; here it is the fits that make the reward surer). One member has no spread.
+    """
+    found: Floats = values.min(0) if settings.by == "worst" else values.mean(0)
+    beta = settings.optimism * (1 - settings.optimism_decay) ** max(fits - 1, 0)
+    spread = beta - (settings.caution if settings.by == "lower" else 0.0)
+    return found + spread * values.std(0) if spread else found
+
+
+__all__ = ["Ensemble", "combine"]

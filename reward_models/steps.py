@@ -1,0 +1,301 @@
+"""What every reward model for control shares: a network says something of each step, and a segment's score is the sum.
+
+A network is small: it maps normalised steps to outputs, E members at once. All else is here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from prefrl.components import ConfigError
+from prefrl.protocols import ControlTask, Task
+from prefrl.reward_models.ensemble import Ensemble, combine
+from prefrl.reward_models.history import looking_back
+from prefrl.types import Floats, Segment, State
+
+STEPS, NUMBERS = 4096, 4_194_304
+"""Steps, and numbers in their inputs, that go through a network at once: what it makes of them then stays in cache."""
+
+Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
+Solve: TypeAlias = Callable[[Tensor, Tensor, Callable[[Tensor], Tensor]], None]
+"""Fit a network without descent: normalised inputs (N, T, I), what a step counts in a score (N, T), the fit's loss."""
+
+
+class Network(Protocol):
+    """E members evaluated in one pass."""
+
+    @property
+    def members(self) -> int: ...
+
+    @property
+    def memory(self) -> int:
+        """How many steps an output looks at, its own included."""
+
+    def named(self) -> Mapping[str, Tensor]:
+        """Everything that is saved. What is a parameter is fitted by descent."""
+
+    def outputs(self, inputs: Tensor) -> Tensor:
+        """(B, T, I) normalised steps, T <= memory -> (E, B, T). No step sees a later one."""
+
+    @property
+    def first(self) -> tuple[Tensor, Tensor] | None:
+        """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+
+
+class StepReward:
+    """A `prefrl.protocols.StepRewardModel`: an ensemble of normalised members (Christiano et al. 2017, section 2.2.3).
+
+    A segment's raw score is the sum of its steps' outputs times gain / segment_steps: a constant, so that scores add
+    up over steps, while logits, and with them step sizes and error rates, do not depend on how long segments are. It
+    sees observations and actions only: no time, no end of episode, no gold.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        task: ControlTask,
+        gain: float,
+        ensemble: Ensemble,
+        measure: Measure | None = None,
+        solve: Solve | None = None,
+    ) -> None:
+        self.network, self._ensemble, self._measure, self._solve = network, ensemble, measure or each_input, solve
+        self._sizes, self._gain = (task.observation_size, task.action_size), gain / task.segment_steps
+        self._input_mean, self._input_std = torch.zeros(sum(self._sizes)), torch.ones(sum(self._sizes))
+        self._shift, self._scale = torch.zeros(network.members), torch.ones(network.members)
+        self._temperature, self._fits = 1.0, 0
+
+    @property
+    def members(self) -> int:
+        return self.network.members
+
+    @property
+    def memory(self) -> int:
+        return self.network.memory
+
+    @property
+    def fitted(self) -> bool:
+        return self._fits > 0
+
+    def parameters(self) -> Iterable[torch.nn.Parameter]:
+        return [p for p in self.network.named().values() if isinstance(p, torch.nn.Parameter)]
+
+    def stack(self, candidates: Sequence[Segment]) -> Mapping[str, Tensor]:
+        """Normalised inputs (N, T, O + A) and mask (N, T). Begins a fit: mean and std are measured here, and stay.
+
+        Raises ValueError for a segment of other sizes than the task's.
+        """
+        steps, lengths = self._steps(candidates), torch.tensor([len(c) for c in candidates])
+        mask = torch.arange(int(lengths.max())) < lengths[:, None]
+        self._rebase(steps)
+        steps = self._normalised(steps)
+        if mask.all():
+            return {"inputs": steps.view(*mask.shape, -1), "mask": mask.float()}
+        inputs = steps.new_zeros(*mask.shape, steps.shape[1])
+        inputs[mask] = steps
+        return {"inputs": inputs, "mask": mask.float()}
+
+    def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
+        inputs, mask = stacked["inputs"], stacked["mask"]
+        if self.memory == 1:
+            outputs = self._pointwise(inputs.flatten(0, 1)).view(self.members, *mask.shape)
+        elif mask.shape[1] <= self.memory:
+            outputs = self.network.outputs(inputs)
+        else:
+            outputs = mask.new_zeros(self.members, *mask.shape)
+            outputs[:, mask.bool()] = self._outputs(*_flat(inputs, mask))
+        return (outputs * mask).sum(2) * self._gain
+
+    @torch.no_grad()
+    def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
+        inputs, mask = stacked["inputs"], stacked["mask"]
+        if self._solve is not None:
+            self._solve(inputs, mask * self._gain, loss)
+        real, begins = _flat(inputs, mask)
+        outputs = self._outputs(real, begins)
+        self._shift, self._scale = outputs.mean(1), outputs.std(1, correction=0).clamp(min=1e-6)
+        self._temperature, self._fits = 1.0, self._fits + 1
+        sums = np.add.reduceat(outputs.numpy(), np.flatnonzero(begins), -1)
+        return torch.from_numpy(sums) * self._gain
+
+    def calibrate(self, temperature: float) -> None:
+        self._temperature = temperature
+
+    def raw_member_scores(self, candidates: Sequence[Segment]) -> Floats:
+        outputs = self._of(candidates, self._outputs)
+        raw: Floats = _sums(outputs, candidates) * np.float32(self._gain / self._temperature)
+        return raw
+
+    def member_scores(self, candidates: Sequence[Segment]) -> Floats:
+        return _sums(self._of(candidates, self._member_rewards), candidates)
+
+    def score(self, candidates: Sequence[Segment]) -> Floats:
+        """(N,) sums of the steps' rewards: members are put together at each step, as in `rewards`."""
+        rewards = self._of(candidates, self._member_rewards)
+        return _sums(combine(rewards, self._ensemble, self._fits), candidates)
+
+    @torch.no_grad()
+    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+        shape = observations.shape[:2]
+        marks = np.zeros(shape, bool) if begins is None else np.array(begins, bool)
+        if observations.ndim != 3 or actions.shape[:2] != shape or marks.shape != shape:
+            raise ValueError(
+                f"rewards need observations (B, T, O), actions (B, T, A) and begins (B, T), got "
+                f"{observations.shape}, {actions.shape} and {marks.shape}"
+            )
+        marks[:, :1] = True
+        steps = self._normalised(self._inputs(observations, actions).flatten(0, 1))
+        found = self._member_rewards(steps, marks.ravel()).numpy()
+        return combine(found, self._ensemble, self._fits).reshape(shape)
+
+    def features(self, candidates: Sequence[Segment]) -> Floats:
+        """(N, 2 (O + A)): the mean and std of a segment's inputs over its steps, normalised as in the last fit.
+
+        Before the first fit they are normalised by these candidates.
+        """
+        steps = self._steps(candidates)
+        mean, std = (self._input_mean, self._input_std) if self.fitted else self._measure(steps)
+        parts = torch.split((steps - mean) / std, [len(c) for c in candidates])
+        found: Floats = torch.stack([torch.cat([p.mean(0), p.std(0, correction=0)]) for p in parts]).numpy()
+        return found
+
+    def state(self) -> State:
+        tensors = {name: x.detach().clone() for name, x in self._saved().items()}
+        return {**tensors, "temperature": self._temperature, "fits": self._fits}
+
+    @torch.no_grad()
+    def load(self, state: State) -> None:
+        """Raises ValueError where names or shapes differ."""
+        saved = self._saved()
+        for name, own in saved.items():
+            found = tuple(state[name].shape) if name in state else "no shape, it is missing"
+            if found != tuple(own.shape):
+                raise ValueError(f"reward model: {name} has shape {found}, expected {tuple(own.shape)}: other settings")
+        for name, own in saved.items():
+            own.copy_(state[name])
+        self._temperature, self._fits = float(state["temperature"]), int(state["fits"])
+
+    def _saved(self) -> dict[str, Tensor]:
+        inputs = {"input_mean": self._input_mean, "input_std": self._input_std}
+        return {**self.network.named(), **inputs, "shift": self._shift, "scale": self._scale}
+
+    @torch.no_grad()
+    def _of(self, candidates: Sequence[Segment], what: Callable[[Tensor, np.ndarray], Tensor]) -> Floats:
+        """(E, S): `what` of the steps of all candidates, one after another."""
+        steps, begins = self._steps(candidates), np.zeros(sum(len(c) for c in candidates), bool)
+        begins[_starts(candidates)] = True
+        found: Floats = what(self._normalised(steps), begins).numpy()
+        return found
+
+    def _member_rewards(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
+        return (self._outputs(inputs, begins) - self._shift[:, None]) / self._scale[:, None]
+
+    def _outputs(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
+        """(S, I) normalised steps of pieces that start where `begins` (S,) says -> (E, S): before shift and scale."""
+        if self.memory == 1:
+            return self._pointwise(inputs)
+        return looking_back(self.network.outputs, inputs, begins, self.memory, _most(inputs))
+
+    def _pointwise(self, inputs: Tensor) -> Tensor:
+        """(S, I) -> (E, S), of a network that sees one step at a time."""
+        parts = [self.network.outputs(x[:, None])[:, :, 0] for x in torch.split(inputs, _most(inputs))]
+        return torch.cat(parts, 1)
+
+    def _normalised(self, steps: Tensor) -> Tensor:
+        return (steps - self._input_mean).div_(self._input_std)
+
+    @torch.no_grad()
+    def _rebase(self, steps: Tensor) -> None:
+        """Normalise by these inputs from now on; a fitted network's first layer makes up for it: it says the same.
+
+        A fitted network whose inputs meet no such layer keeps the normaliser of its first fit.
+        """
+        first = self.network.first
+        if self.fitted and first is None:
+            return
+        mean, std = self._measure(steps)
+        if not mean.isfinite().all():  # what is not finite must only spoil its own candidate's score
+            mean, std = self._measure(steps[steps.isfinite().all(1)])
+        if self.fitted and first is not None:
+            weight = first[0] / self._input_std[:, None]
+            first[1].add_((mean - self._input_mean)[None, None] @ weight)
+            first[0].copy_(weight * std[:, None])
+        self._input_mean, self._input_std = mean, std
+
+    def _steps(self, candidates: Sequence[Segment]) -> Tensor:
+        """(S, O + A): the steps of all candidates, one after another."""
+        if not len(candidates):
+            raise ValueError("a reward model scores at least one segment at a time, got none")
+        for one in candidates:
+            self._check(one.observations, one.actions)
+        steps = torch.empty(sum(len(c) for c in candidates), sum(self._sizes))
+        inside = steps.numpy()
+        np.concatenate([c.observations for c in candidates], out=inside[:, : self._sizes[0]], casting="unsafe")
+        np.concatenate([c.actions for c in candidates], out=inside[:, self._sizes[0] :], casting="unsafe")
+        return steps
+
+    def _inputs(self, observations: Floats, actions: Floats) -> Tensor:
+        """(..., O + A)."""
+        self._check(observations, actions)
+        both = np.concatenate([observations, actions], -1, dtype=np.float32, casting="unsafe")
+        return torch.from_numpy(both)
+
+    def _check(self, observations: Floats, actions: Floats) -> None:
+        if (observations.shape[-1], actions.shape[-1]) != self._sizes or not observations.size:
+            raise ValueError(
+                f"this reward model needs observations (..., {self._sizes[0]}) and actions (..., {self._sizes[1]}), as "
+                f"its task has them, of at least one step; got {observations.shape} and {actions.shape}"
+            )
+        for name, values in (("observations", observations), ("actions", actions)):
+            if values.dtype.kind not in "fiub":
+                raise ValueError(f"{name} must be real numbers, got dtype {values.dtype}")
+
+
+def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean and std of each input; a constant has std 1."""
+    mean = steps.mean(0)
+    std = (steps - mean).square_().mean(0).sqrt()  # several times faster than Tensor.std over the first axis
+    return mean, torch.where(std > 1e-6, std, 1.0)
+
+
+def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:
+    """torch.nn.Linear's default start: uniform within 1 / sqrt(fan in)."""
+    return torch.nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) / math.sqrt(fan_in))
+
+
+def control(task: Task, kind: str) -> ControlTask:
+    """A task, known to be of control. Raises `ConfigError` for others."""
+    if task.kind != "control":
+        raise ConfigError(f"reward kind {kind!r} scores control segments, but the task is of kind {task.kind!r}")
+    return task  # type: ignore[return-value]
+
+
+def _most(inputs: Tensor) -> int:
+    return max(1, min(STEPS, NUMBERS // inputs.shape[1]))
+
+
+def _flat(inputs: Tensor, mask: Tensor) -> tuple[Tensor, np.ndarray]:
+    """The real steps (S, I) of padded candidates, and where candidates begin (S,)."""
+    real = mask.bool()
+    begins = torch.zeros_like(real)
+    begins[:, 0] = True
+    if real.all():
+        return inputs.flatten(0, 1), begins.flatten().numpy()
+    return inputs[real], begins[real].numpy()
+
+
+def _starts(candidates: Sequence[Segment]) -> np.ndarray:
+    return np.cumsum([0, *(len(c) for c in candidates[:-1])])
+
+
+def _sums(steps: Floats, candidates: Sequence[Segment]) -> Floats:
+    """(..., S) values of the steps of N candidates -> (..., N) sums."""
+    sums: Floats = np.add.reduceat(steps, _starts(candidates), -1)
+    return sums
