@@ -1,67 +1,206 @@
-"""A simulated teacher that sees the hidden gold."""
+"""A simulated teacher that sees the hidden gold, as rational or as faulty as its settings say."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
+from prefrl.label import teachers
+from prefrl.label.teachers import Limits, Survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import C, Comparison, Judgement, Query, Ranking
+from prefrl.types import Answer, C, Choice, Comparison, Floats, Query, Ranking, Rating, Skip
+
+ONE_OF = (
+    ["rationality", "error_rate"],
+    ["skip_below", "skip_rate", "skip_epsilon"],
+    ["tie_within", "tie_rate", "tie_epsilon"],
+)
+"""Ways of saying the same thing."""
+RELATIVE = ("error_rate", "skip_rate", "tie_rate", "skip_epsilon", "tie_epsilon", "length_bias")
+"""Settings that are measured against the gold of what has been asked."""
 
 
 class OracleSettings(Settings):
-    """Prefer the candidate with the higher gold."""
+    """Prefer the candidate with the higher gold; the faults of B-Pref's teachers can be switched on."""
 
     kind: Literal["oracle"] = "oracle"
+    name: str = Field("oracle", min_length=1)
+    """Who answers; kept with every answer."""
+    judgement: Literal["ranking", "choice", "rating"] = "ranking"
+    """What is said of K candidates: their order (two: a comparison), the best one, or a level for each."""
+    scale: int = Field(5, ge=2)
+    """Levels of a rating; each is given to an equal share of all candidates asked about so far."""
+    rationality: float | None = Field(None, gt=0)
+    """Beta of Bradley-Terry, and of Plackett-Luce for rankings, in 1 / gold; never wrong when not given."""
+    error_rate: float | None = Field(None, gt=0, le=0.49)
+    """In the place of rationality: the share of decided pairs, of all asked so far, that is expected to be wrong."""
     mistake_rate: float = Field(0.0, ge=0, le=1)
-    """The probability that a judgement is turned upside down (B-Pref's mistake teacher)."""
+    """The probability that a judgement is turned upside down; ties stay ties."""
+    skip_below: float | None = None
+    """Queries whose best candidate has less gold are skipped."""
+    skip_rate: float = Field(0.0, ge=0, lt=1)
+    """The same, with the threshold at this quantile of the best candidates of all queries asked so far."""
+    skip_epsilon: float = Field(0.0, ge=0)
+    """The same, with the threshold at this share of the mean gold of a candidate in this session (B-Pref's)."""
     tie_within: float = Field(0.0, ge=0)
     """Gold scores that differ by no more than this are judged equal."""
+    tie_rate: float = Field(0.0, ge=0, lt=1)
+    """The same, so wide that this share of the pairs asked so far and not skipped is judged equal."""
+    tie_epsilon: float = Field(0.0, ge=0)
+    """The same, at this share of the mean gold of a candidate in this session (B-Pref's)."""
+    discount: float = Field(1.0, gt=0, le=1)
+    """Of earlier steps against the last one: below 1 the teacher is myopic. Control only."""
+    position_bias: float = Field(0.0, ge=0, le=1)
+    """The probability that candidates are ranked as they were shown, whatever they are; ties stay ties."""
+    length_bias: float = 0.0
+    """What a typical difference in length is worth, in typical differences in gold (root mean squares). Text only."""
+    bpref_compat: bool = False
+    """Multiply by epsilon twice after the first session, as the code of B-Pref and its family does."""
+
+    @model_validator(mode="after")
+    def _no_contradiction(self) -> OracleSettings:
+        fields = type(self).model_fields
+        for names in ONE_OF:
+            if len(given := [name for name in names if getattr(self, name) != fields[name].default]) > 1:
+                raise ValueError(f"give one of {' and '.join(given)}: both say the same thing")
+        if self.bpref_compat and not (self.skip_epsilon or self.tie_epsilon):
+            raise ValueError("bpref_compat changes skip_epsilon and tie_epsilon only: give one of them")
+        if self.judgement == "rating" and self.position_bias:
+            raise ValueError("position_bias changes an order, and a rating has none: leave it at 0")
+        return self
+
+    @property
+    def relative(self) -> bool:
+        """Whether the noise hangs on what else has been asked."""
+        return self.judgement == "rating" or any(getattr(self, name) for name in RELATIVE)
 
     def build(self, task: Task) -> Oracle:
+        if task.kind == "text" and self.discount != 1:
+            raise ConfigError(
+                f"labeler.discount: the gold of a text has one step, so expected 1, got {self.discount}; "
+                "a myopic teacher needs a control task"
+            )
+        if task.kind != "text" and self.length_bias:
+            raise ConfigError("labeler.length_bias: only texts differ in length; expected 0 for a control task")
         return Oracle(self)
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """Answers every open query at once."""
+    """Answers every open query at once (B-Pref's simulated teachers: Lee et al. 2021, section 4.2)."""
 
     settings: OracleSettings
-    name: str = "oracle"
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
 
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
-        """Each answer hangs on its query alone, not on the order: a resumed run gets the same ones."""
+        """Each answer hangs on its query and on the set of queries asked so far, not on the order of either.
+
+        So a run that was killed gives the same ones when it goes on. Raises `ValueError` where gold is not finite.
+        """
         base = draw_seed(rng)
         queries = store.open_queries(self.name)
-        store.answer([self.judge(q, store.gold(q.candidates), keyed(base, q.id)) for q in queries])
+        limits = self.limits(teachers.survey(store, self.name) if queries and self.settings.relative else None)
+        store.answer([self.judge(q, store.gold(q.candidates), keyed(base, q.id), limits) for q in queries])
 
-    def judge(self, query: Query[C], gold: Sequence[np.ndarray], rng: np.random.Generator) -> Judgement:
-        """Judge one query from the gold of its candidates, shown in a random order."""
-        scores = np.array([values.sum() for values in gold], float)
-        if not np.isfinite(scores).all():
+    def limits(self, asked: Survey[C] | None) -> Limits:
+        """The teacher's noise in units of gold; relative settings need to know what has been asked."""
+        s = self.settings
+        found = Limits(-np.inf if s.skip_below is None else s.skip_below, s.tie_within, s.rationality)
+        if not s.relative or asked is None or not asked.queries:
+            return found
+        found = self._with_length(found, asked)
+        seen = teachers.blocks([self.see(q, asked.gold[q.id], found) for q in asked.queries])
+        return self._with_noise(self._with_thresholds(found, asked, seen), seen)
+
+    def _with_length(self, found: Limits, asked: Survey[C]) -> Limits:
+        """The price of a character, from the spread of gold and of length within queries."""
+        if not self.settings.length_bias:
+            return found
+        sizes = [teachers.lengths(q) for q in asked.queries]
+        long = teachers.gaps(teachers.blocks(sizes))
+        wide = teachers.gaps(teachers.blocks([self.see(q, asked.gold[q.id], found) for q in asked.queries]))
+        if not long.any():
+            return found
+        price = self.settings.length_bias * float(np.sqrt(np.mean(wide**2) / np.mean(long**2)))
+        return replace(found, length_price=price, length_mean=float(np.concatenate(sizes).mean()))
+
+    def _with_thresholds(self, found: Limits, asked: Survey[C], seen: list[Floats]) -> Limits:
+        s, below, within = self.settings, found.skip_below, found.tie_within
+        if s.skip_rate:
+            below = teachers.skip_threshold(seen, s.skip_rate)
+        if s.skip_epsilon and (threshold := teachers.session_threshold(asked, s.skip_epsilon, s.bpref_compat)) > 0:
+            below = threshold
+        kept = _unskipped(seen, below)
+        if s.tie_rate and kept:
+            within = teachers.tie_threshold(kept, s.tie_rate)
+        if s.tie_epsilon:
+            within = max(0.0, teachers.session_threshold(asked, s.tie_epsilon, s.bpref_compat))
+        return replace(found, skip_below=below, tie_within=within)
+
+    def _with_noise(self, found: Limits, seen: list[Floats]) -> Limits:
+        s, beta, kept = self.settings, found.rationality, _unskipped(seen, found.skip_below)
+        if s.error_rate and kept:
+            beta = teachers.rationality_for(kept, found.tie_within, s.error_rate)
+        if s.judgement != "rating":
+            return replace(found, rationality=beta)
+        levels = np.quantile(np.concatenate([block.ravel() for block in seen]), np.arange(1, s.scale) / s.scale)
+        return replace(found, rationality=beta, cuts=tuple(levels.tolist()))
+
+    def see(self, query: Query[C], gold: Sequence[Floats], limits: Limits) -> Floats:
+        """(K,) what each candidate seems to be worth: its gold, discounted, plus what its length adds."""
+        try:
+            seen = teachers.discounted(gold, self.settings.discount)
+        except ValueError as error:
+            raise ValueError(f"query {query.id[:12]}: {error}") from None
+        return seen + limits.length_price * (teachers.lengths(query) - limits.length_mean)
+
+    def judge(self, query: Query[C], gold: Sequence[Floats], rng: np.random.Generator, limits: Limits) -> Answer:
+        """Answer one query from the gold of its candidates, shown in a random order."""
+        seen = self.see(query, gold, limits)
+        mistaken = bool(rng.random() < self.settings.mistake_rate)
+        shown = tuple(int(i) for i in rng.permutation(len(seen)))
+        if seen.max() < limits.skip_below:
+            return Skip(query.id, "skip", self.name, shown)
+        groups = teachers.tie_groups(seen[None], limits.tie_within)
+        worth = teachers.group_means(seen[None], groups)[0]
+        if limits.rationality is not None:  # the order of values plus Gumbel noise is a draw from Plackett-Luce
+            worth = worth + (rng.gumbel(size=len(seen))[groups[0]] - np.euler_gamma) / limits.rationality
+        if self.settings.judgement == "rating":
+            return self._rate(query, worth, mistaken, shown, limits)
+        if rng.random() < self.settings.position_bias:
+            worth = -np.array([min(shown.index(j) for j in np.flatnonzero(groups[0] == g)) for g in groups[0]], float)
+        return self._order(query, -worth if mistaken else worth, shown, rng)
+
+    def _rate(self, query: Query[C], worth: Floats, mistaken: bool, shown: tuple[int, ...], limits: Limits) -> Rating:
+        scale = self.settings.scale
+        levels = [int(level) for level in np.searchsorted(limits.cuts, worth, side="right")]
+        levels = [scale - 1 - level for level in levels] if mistaken else levels
+        return Rating(query.id, tuple(levels), scale, self.name, shown)
+
+    def _order(self, query: Query[C], worth: Floats, shown: tuple[int, ...], rng: np.random.Generator) -> Answer:
+        """Equal worth is a tie; the best of several equal ones is drawn at random."""
+        if len(worth) < 2:
             raise ValueError(
-                f"the oracle needs finite gold, got {scores} for query {query.id[:12]}; use another labeler"
+                f"query {query.id[:12]} has one candidate, which can only be rated: use labeler.judgement=rating"
             )
-        if rng.random() < self.settings.mistake_rate:
-            scores = -scores
-        shown = tuple(int(i) for i in rng.permutation(len(scores)))
-        ranks = _ranks(scores, self.settings.tie_within)
+        ranks = np.unique(-worth, return_inverse=True)[1]
+        if self.settings.judgement == "choice":
+            return Choice(query.id, int(rng.choice(np.flatnonzero(ranks == 0))), self.name, shown)
         if len(ranks) > 2:
-            return Ranking(query.id, ranks, self.name, shown)
+            return Ranking(query.id, tuple(ranks.tolist()), self.name, shown)
         return Comparison(query.id, 0.5 + 0.5 * float(np.sign(ranks[1] - ranks[0])), self.name, shown)
 
 
-def _ranks(scores: np.ndarray, tie_within: float) -> tuple[int, ...]:
-    """0 for the best; a score joins the group above while it is within reach of that group's best."""
-    ranks, rank, best = [0] * len(scores), -1, np.inf
-    for i in np.argsort(-scores, kind="stable"):
-        if rank < 0 or best - scores[i] > tie_within:
-            rank, best = rank + 1, scores[i]
-        ranks[i] = rank
-    return tuple(ranks)
+def _unskipped(seen: list[Floats], skip_below: float) -> list[Floats]:
+    """The queries that are judged."""
+    kept = [block[block.max(1) >= skip_below] for block in seen]
+    return [block for block in kept if len(block)]

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from prefrl.label.exchange import export_bundle, export_preferences, import_bundle, import_preferences
+from prefrl.label.exchange import export_bundle, export_preferences, import_bundle, import_judgements
 from prefrl.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
@@ -25,7 +25,7 @@ def texts(*names: str) -> Query[Response]:
 def test_preferences_survive_going_out_and_coming_back(text_store: Store[Response], tmp_path: Path) -> None:
     path, again = tmp_path / "in.jsonl", tmp_path / "out.jsonl"
     path.write_text(lines(GOOD, {"prompt": "q", "chosen": "ü \u202e <b>", "rejected": ""}))
-    assert import_preferences(path, text_store) == 2
+    assert import_judgements(path, text_store).read == 2
     assert export_preferences(text_store, again).written == 2
     assert [json.loads(x) for x in again.read_text().splitlines()] == [
         json.loads(x) for x in path.read_text().splitlines()
@@ -49,12 +49,12 @@ def test_tables_are_read_as_well(text_store: Store[Response], tmp_path: Path, su
     table = datasets.Dataset.from_list([GOOD, {"prompt": 'q, "r"', "chosen": "a\nb", "rejected": "c"}])
     path = tmp_path / f"in{suffix}"
     (table.to_csv if suffix == ".csv" else table.to_parquet)(str(path))
-    assert import_preferences(path, text_store) == 2
+    assert import_judgements(path, text_store).read == 2
     assert {c.text for j in text_store.judged() for c in j.query.candidates} == {"yes", "no", "a\nb", "c"}
     broken = datasets.Dataset.from_list([GOOD, GOOD | {"chosen": None}])
     (broken.to_csv if suffix == ".csv" else broken.to_parquet)(str(path))
     with pytest.raises(ValueError, match="row 2: column 'chosen': expected a string, got None"):
-        import_preferences(path, text_store)
+        import_judgements(path, text_store)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_bad_row_is_named_and_nothing_is_imported(
     path = tmp_path / "bad.jsonl"
     path.write_text(lines(GOOD) + row + "\n" + lines(GOOD))
     with pytest.raises(ValueError) as caught:
-        import_preferences(path, text_store)
+        import_judgements(path, text_store)
     assert message in str(caught.value)
     assert text_store.counts()["asked"] == 0
 
@@ -85,16 +85,16 @@ def test_many_bad_rows_are_cut_at_twenty_and_an_empty_file_is_an_error(
     path = tmp_path / "bad.jsonl"
     path.write_text("{}\n" * 50)
     with pytest.raises(ValueError, match="and 30 more"):
-        import_preferences(path, text_store)
+        import_judgements(path, text_store)
     path.write_text("")
     with pytest.raises(ValueError, match="at least one row"):
-        import_preferences(path, text_store)
+        import_judgements(path, text_store)
 
 
 def test_a_contradiction_is_kept_as_two_judgements(text_store: Store[Response], tmp_path: Path) -> None:
     path = tmp_path / "in.jsonl"
     path.write_text(lines(GOOD, {"prompt": "p", "chosen": "no", "rejected": "yes"}))
-    import_preferences(path, text_store)
+    import_judgements(path, text_store)
     judgements = [j.judgement for j in text_store.judged()]
     assert sorted(j.preference for j in judgements if isinstance(j, Comparison)) == [0.0, 1.0]
     assert len({j.labeler for j in judgements}) == 2
@@ -154,8 +154,8 @@ def test_segments_do_not_fit_text_columns_and_the_error_says_what_does(
 def test_two_files_that_contradict_each_other_are_both_kept(text_store: Store[Response], tmp_path: Path) -> None:
     for name, row in (("a", GOOD), ("b", {"prompt": "p", "chosen": "no", "rejected": "yes"})):
         (tmp_path / name).write_text(lines(row))
-        import_preferences(tmp_path / name, text_store)
-        import_preferences(tmp_path / name, text_store)  # again: nothing changes
+        import_judgements(tmp_path / name, text_store)
+        import_judgements(tmp_path / name, text_store)  # again: nothing changes
     assert text_store.counts() == {"asked": 1, "answered": 2, "skipped": 0}
 
 
@@ -165,7 +165,7 @@ def test_any_text_survives_both_forms(text_store: Store[Response], tmp_path: Pat
     text_store.answer([Comparison(query.id, 1.0, "me")])
     export_preferences(text_store, tmp_path / "out.jsonl")
     export_bundle(text_store, tmp_path / "bundle")
-    for read, name in ((import_preferences, "out.jsonl"), (import_bundle, "bundle")):
+    for read, name in ((import_judgements, "out.jsonl"), (import_bundle, "bundle")):
         with Store[Response](tmp_path / f"copy of {name}") as copy:
             read(tmp_path / name, copy)
             (judged,) = copy.judged()
@@ -202,7 +202,7 @@ def test_texts_do_not_get_into_a_store_of_segments(
     (tmp_path / "in.jsonl").write_text(lines(GOOD))
     mixed: Any = store
     with pytest.raises(StoreError, match="holds segments"):
-        import_preferences(tmp_path / "in.jsonl", mixed)
+        import_judgements(tmp_path / "in.jsonl", mixed)
 
 
 def test_a_bundle_never_takes_the_place_of_other_things(
