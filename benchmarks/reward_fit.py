@@ -3,7 +3,7 @@
     python benchmarks/reward_fit.py [--short] [--peers .venv-peers-control/bin/python]
 
 500 pairs of segments of 100 steps (HalfCheetah's sizes: 17 observations, 6 actions), one epoch in minibatches of 32
-pairs, AdamW, the same network (32x32, 64x64, 256x256x256; tanh), one thread. imitation's `BasicRewardTrainer` with
+pairs, AdamW, the same network (32x32, 64x64, 256x256x256; ReLU, imitation's default), one thread. imitation's `BasicRewardTrainer` with
 its `CrossEntropyRewardLoss` gets the pairs in its own dataset, ready made; ours gets judgements, and everything from
 them on counts: batching, stacking, the split's graph, the epoch, normalisation and the measured losses. Sides take
 turns in one process group; medians of the repetitions. `ratio` is peer / ours at width 32. `ensemble` is our time
@@ -126,14 +126,15 @@ def ours() -> Any:
     segments = [Segment(observations[i], actions[i], str(i), 0) for i in range(2 * PAIRS)]
     queries = [Query((segments[2 * i], segments[2 * i + 1])) for i in range(PAIRS)]
     judged = [Judged(q, Comparison(q.id, float(p))) for q, p in zip(queries, preference, strict=True)]
-    settings = FittingSettings(epochs=1, batch_size=MINIBATCH, learning_rate=RATE, held_out=0.0)
+    fitting = FittingSettings(epochs=1, batch_size=MINIBATCH, learning_rate=RATE, held_out=0.0)
 
     def run(width: str) -> float:
         hidden, _, members = width.partition("x")
         task: Any = Task()
-        reward = MLPSettings(members=int(members or 1), hidden=WIDTHS[hidden]).build(task, np.random.default_rng(0))
+        settings = MLPSettings(members=int(members or 1), hidden=WIDTHS[hidden], activation="relu")
+        reward = settings.build(task, np.random.default_rng(0))
         begin = time.process_time()
-        fit_judged(reward, judged, settings, np.random.default_rng(0))
+        fit_judged(reward, judged, fitting, np.random.default_rng(0))
         return time.process_time() - begin
 
     return run
@@ -161,7 +162,7 @@ def peer() -> Any:
     def run(width: str) -> float:
         torch.manual_seed(0)
         net = BasicRewardNet(
-            observation_space, action_space, use_next_state=False, hid_sizes=WIDTHS[width], activation=torch.nn.Tanh
+            observation_space, action_space, use_next_state=False, hid_sizes=WIDTHS[width]
         )
         loss = pc.CrossEntropyRewardLoss()
         trainer = pc.BasicRewardTrainer(

@@ -85,11 +85,11 @@ class Reviews:
         found: list[str] = []
         while len(found) < count:
             prompt, _ = self._grammar.sample(rng)
-            if _for_evaluation(prompt) == evaluation:
+            if for_evaluation(prompt) == evaluation:
                 found.append(prompt)
         return found
 
 
-def _for_evaluation(prompt: str) -> bool:
+def for_evaluation(prompt: str) -> bool:
     """By a digest of the words: the split is the same in every run."""
     return hashlib.sha256(prompt.encode()).digest()[0] % EVALUATION_SHARE == 0

@@ -13,7 +13,6 @@ import typer
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
     from prefrl.config import Config
-    from prefrl.rundir import Run
 
 app = typer.Typer(
     help="Learn what people prefer, and act on it: sample, label, fit, improve, evaluate.",
@@ -26,6 +25,8 @@ Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a 
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
 Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
+Labelers = Annotated[str, typer.Option(help="Only judgements by these, separated by commas; default: everybody's.")]
+Split = Annotated[str, typer.Option(help="Only this part of a file, train or eval say; default: all of it.")]
 
 
 FEW = 20
@@ -33,10 +34,11 @@ FEW = 20
 
 
 class Form(StrEnum):
-    """How judgements lie in files."""
+    """What is written to files, and how."""
 
     preferences = "preferences"
     bundle = "bundle"
+    classifier = "classifier"
 
 
 @app.command()
@@ -49,6 +51,7 @@ def run(
     ] = False,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
+    from prefrl.console import drive
     from prefrl.rundir import Run
 
     config = _load(source, overrides)
@@ -57,15 +60,16 @@ def run(
         return
     if out is None:
         raise typer.BadParameter("say where the run goes: --out DIR (or --dry-run)")
-    _drive(Run(config, out))
+    drive(Run(config, out))
 
 
 @app.command()
 def resume(folder: Folder) -> None:
     """Go on with a run that was stopped."""
+    from prefrl.console import drive
     from prefrl.rundir import Run
 
-    _drive(Run.resume(folder))
+    drive(Run.resume(folder))
 
 
 @app.command()
@@ -98,28 +102,25 @@ def label(
 
 @app.command()
 def fit(
-    source: Annotated[Path, typer.Argument(help="A folder with a store, or a file of prompt/chosen/rejected lines.")],
+    source: Annotated[Path, typer.Argument(help="A folder with a store, or a file of judgements.")],
     overrides: Overrides = None,
     config: Annotated[str | None, typer.Option(help="Preset or YAML file; default: the folder's own.")] = None,
+    labelers: Labelers = "",
+    split: Split = "",
     out: Out = Path("reward"),
 ) -> None:
     """Fit a reward model on judgements, and save it."""
     from prefrl import stages
-    from prefrl.components import ConfigError
     from prefrl.console import console, metrics_table, say
+    from prefrl.label.formats import Which
 
-    if not source.exists():
-        raise ConfigError(f"{source}: no such file or folder")
-    if config is None and source.is_file():
-        raise ConfigError(f"{source} is a file of preferences: say which settings to use, --config text/reviews say")
-    if config is None and not (source / "config.yaml").is_file():
-        raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
-    fitted = stages.fit_reward(_load(config or str(source / "config.yaml"), overrides), source, out)
+    settings = _load(stages.config_of(source, config), overrides)
+    fitted, notes = stages.fit_reward(settings, source, out, Which.of(labelers, split))
     console.print(metrics_table(f"reward model in {out}", fitted.metrics))
-    if fitted.metrics["held_out"] < FEW:
-        say(
-            f"only {fitted.metrics['held_out']:.0f} comparisons were held out: their accuracy says little yet", "yellow"
-        )
+    count = fitted.metrics["held_out"]
+    few = f"only {count:.0f} comparisons were held out: their accuracy says little" if count else "nothing was held out"
+    for note in [*notes, *([few] if count < FEW else [])]:
+        say(note, "yellow")
 
 
 @app.command()
@@ -131,18 +132,43 @@ def improve(
 ) -> None:
     """Improve a policy against a saved reward model."""
     from prefrl import stages
+    from prefrl.console import drive
     from prefrl.rundir import Run
 
-    _drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
+    drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
 
 
 @app.command()
-def evaluate(folder: Folder) -> None:
-    """Evaluate the newest policy of a run."""
+def evaluate(
+    folder: Annotated[Path | None, typer.Argument(help="A run, whose policy is evaluated.", show_default=False)] = None,
+    reward: Annotated[
+        Path | None, typer.Option(help="Grade this reward model instead: a run, or what `prefrl fit` wrote.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Judgements to grade it on; default: what the run held out.")
+    ] = None,
+    held_out: Annotated[bool, typer.Option("--held-out", help="Of the data, only what a fit leaves out.")] = False,
+    labelers: Labelers = "",
+    split: Split = "",
+    json_: Annotated[Path | None, typer.Option("--json", help="Write the report card there.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write it as a page there.")] = None,
+    rewardbench: Annotated[
+        Path | None, typer.Option(help="Write the scores of text pairs into this folder, as RewardBench does.")
+    ] = None,
+) -> None:
+    """Evaluate the newest policy of a run, or grade a reward model."""
     from prefrl import stages
-    from prefrl.console import console, metrics_table
+    from prefrl.console import card_table, console, metrics_table
+    from prefrl.label.formats import Which
 
-    console.print(metrics_table(f"policy of {folder}", stages.evaluate(folder).metrics))
+    if reward is not None:
+        card = stages.report_card(reward, data, held_out, rewardbench, Which.of(labelers, split))
+        stages.write_card(card, json_, html)
+        console.print(card_table(card))
+    elif folder is not None:
+        console.print(metrics_table(f"policy of {folder}", stages.evaluate(folder).metrics))
+    else:
+        raise typer.BadParameter("say what to evaluate: a run's FOLDER, or --reward FOLDER")
 
 
 @app.command()
@@ -156,14 +182,20 @@ def report(folder: Folder) -> None:
 
 @app.command("export")
 def export_(
-    store: Annotated[Path, typer.Argument(help="A run's folder, or one that `prefrl label` wrote.", exists=True)],
-    to: Annotated[Path, typer.Option(help="A .jsonl file for preferences, a folder for a bundle.")],
+    store: Annotated[Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`.", exists=True)],
+    to: Annotated[Path, typer.Option(help="A .jsonl file for preferences, else a folder.")],
     form: Annotated[
-        Form, typer.Option(help="preferences: prompt/chosen/rejected lines; bundle: loses nothing.")
+        Form, typer.Option(help="prompt/chosen/rejected lines; all there is; a reward model for transformers.")
     ] = Form.preferences,
 ) -> None:
-    """Write judgements to files."""
+    """Write judgements, or a reward model of text, to files."""
     from prefrl.console import say
+
+    if form is Form.classifier:
+        from prefrl.stages import export_classifier
+
+        say(f"{to}: its logit + {export_classifier(store, to):.6g} is the mean of the reward's members")
+        return
     from prefrl.label.exchange import export_bundle, export_preferences
     from prefrl.store import Store
 
@@ -174,17 +206,22 @@ def export_(
 
 @app.command("import")
 def import_(
-    path: Annotated[Path, typer.Argument(help="A file of prompt/chosen/rejected lines, or a bundle.", exists=True)],
+    path: Annotated[Path, typer.Argument(help="A file of judgements, or a bundle.", exists=True)],
+    labelers: Labelers = "",
+    split: Split = "",
     out: Out = Path("labels"),
 ) -> None:
     """Read judgements from files into a store, all or none."""
     from prefrl.console import say
-    from prefrl.label.exchange import import_bundle, import_preferences
+    from prefrl.label.exchange import import_judgements
+    from prefrl.label.formats import Which
     from prefrl.store import Store
 
     with Store[Any](out) as store:
-        count = import_bundle(path, store) if path.is_dir() else import_preferences(path, store)
-    say(f"{count} judgements read into {out}")
+        done = import_judgements(path, store, Which.of(labelers, split))
+    for note in done.notes:
+        say(note, "yellow")
+    say(f"{done.read} judgements read into {out}")
 
 
 @app.command()
@@ -232,32 +269,6 @@ def _load(source: str, overrides: list[str] | None) -> Config:
     if Path(source).is_dir():
         source = str(Path(source) / "config.yaml")
     return Config.load(source, overrides or [])
-
-
-def _drive(running: Run) -> None:
-    """Run to the end, telling how it goes; on Ctrl-C say how to go on."""
-    from prefrl.console import console, progress, round_line, say, summary_table
-
-    with running:
-        for note in running.notes:
-            say(note, "yellow")
-        person = running.config.labeler.model_dump()["kind"] == "terminal"
-        try:
-            with progress(running.loop, quiet=person) as bar:
-                for round in running:
-                    bar.update(bar.task_ids[0], completed=round.number)
-                    console.print(round_line(round), soft_wrap=True)
-                    for note in round.notes:
-                        say(f"  {note}", "yellow")
-        except KeyboardInterrupt:
-            say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
-            raise
-        console.print(summary_table(running.summary))
-        say(f"report: {running.report()}")
-        if not running.loop.reward.fitted:
-            raise ValueError(
-                "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
-            )
 
 
 def _dry_run(config: Config) -> None:

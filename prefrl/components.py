@@ -40,13 +40,20 @@ TABLE: dict[Role, dict[str, str]] = {
         "control": "prefrl.envs.control:ControlSettings",
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
+        "texts": "prefrl.envs.texts:TextsSettings",
     },
     "labelers": {
+        "crowd": "prefrl.label.crowd:CrowdSettings",
+        "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",
         "terminal": "prefrl.label.terminal:TerminalSettings",
     },
     "rewards": {
         "mlp": "prefrl.reward_models.mlp:MLPSettings",
+        "cnn": "prefrl.reward_models.cnn:CNNSettings",
+        "gru": "prefrl.reward_models.sequence:GRUSettings",
+        "preference_transformer": "prefrl.reward_models.sequence:PreferenceTransformerSettings",
+        "linear": "prefrl.reward_models.linear:LinearSettings",
         "transformer": "prefrl.reward_models.text:TransformerSettings",
     },
     "learners": {
@@ -55,8 +62,11 @@ TABLE: dict[Role, dict[str, str]] = {
         "text": "prefrl.improve.text:TextSettings",
     },
     "selectors": {
-        "uniform": "prefrl.sample.select:UniformSettings",
-        "disagreement": "prefrl.sample.select:DisagreementSettings",
+        "uniform": "prefrl.sample.select:UnscoredSettings",
+        "coverage": "prefrl.sample.select:UnscoredSettings",
+        "disagreement": "prefrl.sample.select:ScoredSettings",
+        "entropy": "prefrl.sample.select:ScoredSettings",
+        "information": "prefrl.sample.select:ScoredSettings",
     },
 }
 EXTRAS = {
@@ -66,6 +76,7 @@ EXTRAS = {
     "transformers": "text",
     "tokenizers": "text",
     "datasets": "text",
+    "peft": "text",
     "vaderSentiment": "text",
     "av": "label",
 }

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
-from prefrl.fit.trainer import FittingSettings
+from prefrl.fit.settings import FittingSettings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.seeding import streams
 from prefrl.store import Store

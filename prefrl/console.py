@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import astuple
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -13,8 +14,13 @@ from rich.progress import Task as Row
 from rich.table import Table
 from rich.text import Text
 
+from prefrl.evaluate import card_words
+from prefrl.evaluate.card import ReportCard
 from prefrl.loop import Loop
 from prefrl.types import Round
+
+if TYPE_CHECKING:
+    from prefrl.rundir import Run
 
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
@@ -64,6 +70,30 @@ class _TimeLeft(ProgressColumn):
         return Text(f"about {duration(left)} left", style="dim")
 
 
+def drive(running: Run) -> None:
+    """Run to the end, telling how it goes; on Ctrl-C say how to go on."""
+    with running:
+        for note in running.notes:
+            say(note, "yellow")
+        person = running.config.labeler.model_dump()["kind"] == "terminal"
+        try:
+            with progress(running.loop, quiet=person) as bar:
+                for round in running:
+                    bar.update(bar.task_ids[0], completed=round.number)
+                    console.print(round_line(round), soft_wrap=True)
+                    for note in round.notes:
+                        say(f"  {note}", "yellow")
+        except KeyboardInterrupt:
+            say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
+            raise
+        console.print(summary_table(running.summary))
+        say(f"report: {running.report()}")
+        if not running.loop.reward.fitted:
+            raise ValueError(
+                "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
+            )
+
+
 def say(text: str, style: str = "") -> None:
     """One line as it is: names of files are no markup, and are not broken over lines."""
     console.print(Text(text, style=style), soft_wrap=True)
@@ -109,6 +139,18 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
     """Names and numbers."""
     return table(title, ("metric", "value"), [(name, number(value)) for name, value in metrics.items()])
+
+
+def card_table(card: ReportCard) -> Table:
+    """A reward model's report card: what it comes to, and every number."""
+    made = table(card_words.headline(card), ("", "value", "95 % interval, or why not"), ())
+    made.caption, made.caption_justify = Text(card_words.subject(card.about)), "left"
+    for name, rows in card_words.groups(card):
+        made.add_section()
+        made.add_row(Text(name, style="bold"))
+        for row in rows:
+            made.add_row(*(Text(cell) for cell in astuple(row)))
+    return made
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:

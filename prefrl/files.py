@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import os
 import shutil
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,10 +106,17 @@ def _beside(path: Path) -> Path:
 
 
 def read_lines(path: Path) -> Iterator[str]:
-    """The lines of a UTF-8 file, cut at line feeds alone: in JSON lines other separators belong to the text."""
-    with path.open(encoding="utf-8-sig", newline="\n") as file:
-        for line in file:
-            yield line.rstrip("\r\n")
+    """The lines of a UTF-8 file (.gz or not), cut at line feeds alone: in JSON lines other separators are text.
+
+    Raises `ValueError` where a .gz is damaged.
+    """
+    opened = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opened(path, "rt", encoding="utf-8-sig", newline="\n") as file:
+            for line in file:
+                yield line.rstrip("\r\n")
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise ValueError(f"{path} is no whole gzip file: {error}") from error
 
 
 def verify(folder: Path) -> None:

@@ -16,10 +16,12 @@ import numpy as np
 from prefrl.checkpoints import load_state, save_state
 from prefrl.components import Settings
 from prefrl.config import Config
+from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.examples import save_examples
 from prefrl.evaluate.report import write_report
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.files import MANIFEST, DamagedError, verify, whole_folder, write_file
+from prefrl.grading import discount_of, grade, of_run
 from prefrl.loop import Loop
 from prefrl.protocols import RewardModel, Task
 from prefrl.seeding import streams
@@ -55,6 +57,7 @@ class Run:
             self.loop: Loop[Any] = config.build(self.store)
             self._start_from(reward)
             self._rows = self._restore()
+            self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
             self._events = _events(self.folder, self.loop.round)
         except BaseException:
             self.store.close()
@@ -87,7 +90,13 @@ class Run:
         return summarise(self._rows, self.loop.task, self.config.seed)
 
     def report(self) -> Path:
-        """Write `report.html`, and say where it is."""
+        """Grade the reward model where judgements were held out, write `report.html`, and say where it is."""
+        settings = self.config
+        reward, discount = self.loop.reward, discount_of(settings.learner)
+        subject = of_run(reward, self.store, self.folder, self.loop.round, settings.fitting.held_out, discount)
+        if subject is not None:
+            card = grade(subject, streams(settings.seed, 0).evaluate)
+            write_file(self.folder / "card.json", card.model_dump_json(indent=1).encode())
         return write_report(self.folder)
 
     def _start_from(self, reward: Path | None) -> None:
@@ -117,10 +126,20 @@ class Run:
         if round.fitted is not None and len(round.fitted.predicted):
             pairs = {"predicted": round.fitted.predicted.tolist(), "preference": round.fitted.preference.tolist()}
             write_file(self.folder / "held_out.json", json.dumps({"round": round.number} | pairs).encode())
+        if round.fitted is not None:
+            self._score_probes(round.number)
         self._save_examples(round)
         for name, value in round.metrics.items():
             self._events.add_scalar(name, value, round.number)
         self._checkpoint(round.number)
+
+    def _score_probes(self, number: int) -> None:
+        """The scores of the first judged candidates, the same ones in every round: how far does a refit move them?"""
+        ids = self._probes[0]["candidates"] if self._probes else first_judged(self.store.judged())
+        scores = self.loop.reward.score([self.store.candidate(id) for id in ids])
+        row = {"round": number, "scores": [float(score) for score in scores]}
+        self._probes.append(row if self._probes else row | {"candidates": ids})
+        write_file(self.folder / "probes.jsonl", "".join(json.dumps(r) + "\n" for r in self._probes).encode())
 
     def _save_examples(self, round: Round[Any]) -> None:
         """A few candidates to look at, of the starting policy and of the newest one."""

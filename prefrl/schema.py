@@ -39,7 +39,8 @@ def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str,
     """The schema of one top-level key."""
     if name in ROLES:
         role = ROLES[name]
-        return {"oneOf": [_define(settings_class(role, kind), definitions, kind) for kind in TABLE[role]]}
+        classes = {settings_class(role, kind): kind for kind in TABLE[role]}  # several kinds may share one
+        return {"oneOf": [_define(cls, definitions, kind) for cls, kind in classes.items()]}
     return _define(annotation, definitions, None) if hasattr(annotation, "model_json_schema") else {"type": "integer"}
 
 

@@ -11,11 +11,16 @@ from typing import Any
 import numpy as np
 
 from prefrl.checkpoints import load_state
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
+from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.report import render_card
 from prefrl.files import check_free, read_lines, write_file
 from prefrl.fit.trainer import fit
-from prefrl.label.exchange import import_preferences
+from prefrl.grading import Subject, discount_of, grade, judgements, of_run
+from prefrl.graph import batch
+from prefrl.label.formats import Which
+from prefrl.label.source import open_judgements
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
 from prefrl.store import Store
@@ -75,20 +80,44 @@ def _with_gold(responses: list[Response], task: Any) -> list[Response]:
     return [replace(r, gold=np.array([g])) for r, g in zip(responses, gold, strict=True)]
 
 
-def fit_reward(config: Config, source: Path, out: Path) -> Fitted:
-    """Fit a reward model on a folder's store, or on a file of prompt/chosen/rejected lines, and save it."""
+def config_of(source: Path, config: str | None) -> str:
+    """The preset or file with the settings for a source of judgements: the one given, or the folder's own."""
+    if not source.exists():
+        raise ConfigError(f"{source}: no such file or folder")
+    if config is None and source.is_file():
+        raise ConfigError(f"{source} is a file of judgements: say which settings to use, --config text/replies say")
+    if config is None and not (source / "config.yaml").is_file():
+        raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
+    return config or str(source / "config.yaml")
+
+
+def fit_reward(config: Config, source: Path, out: Path, which: Which | None = None) -> tuple[Fitted, tuple[str, ...]]:
+    """Fit a reward model on the judgements in a folder's store or in a file, and save it.
+
+    Returns what the fit came to, and notes for people on what was left out of a file.
+    """
     check_free(out)
-    with tempfile.TemporaryDirectory() as scratch:
-        from_file = source.is_file()
-        with Store[Any](Path(scratch) if from_file else source, write=from_file) as store:
-            if from_file:
-                import_preferences(source, store)
-            rng = streams(config.seed, 1)
-            settings: Any = config
-            reward = settings.reward.build(settings.task.build(), rng.build)
-            fitted = fit(reward, store, config.fitting, rng.fit)
+    settings: Any = config
+    rng, task = streams(config.seed, 1), settings.task.build()
+    with open_judgements(source, task, which) as (store, notes):
+        reward = settings.reward.build(task, rng.build)
+        fitted = fit(reward, store, config.fitting, rng.fit)
     save_reward(out, config, reward)
-    return fitted
+    return fitted, notes
+
+
+def export_classifier(saved: Path, to: Path) -> float:
+    """Write a saved reward model of text as a sequence classifier of transformers; returns what its logit lacks."""
+    from prefrl.reward_models.io import save_classifier
+    from prefrl.reward_models.text import TransformerReward
+
+    found = open_saved(saved)
+    settings: Any = found.config
+    check_free(to)
+    reward = found.reward(settings.task.build())
+    if not isinstance(reward, TransformerReward):
+        raise RunError(f"{saved} holds a reward of kind {settings.reward.kind!r}: only 'transformer' is a classifier")
+    return save_classifier(reward, to)
 
 
 def with_reward(config: Config, saved: Path) -> Config:
@@ -109,6 +138,65 @@ def evaluate(folder: Path) -> Evaluation[Any]:
         raise RunError(f"{folder} holds no policy to evaluate: {error}") from error
     evaluation: Evaluation[Any] = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
     return evaluation
+
+
+def report_card(
+    model: Path,
+    data: Path | None = None,
+    held_out: bool = False,
+    rewardbench: Path | None = None,
+    which: Which | None = None,
+) -> ReportCard:
+    """Grade a saved reward model: on what its run's newest fit left out, or on the judgements of a folder or a file.
+
+    `held_out`: of `data`, only what a fit on it leaves out, by the model's own settings. `rewardbench`: a folder for
+    the scores of text pairs. Raises `RunError` where there is nothing to grade on.
+    """
+    saved = open_saved(model)
+    settings: Any = saved.config
+    task, share, rng = settings.task.build(), settings.fitting.held_out, streams(settings.seed, 0).evaluate
+    reward, discount = saved.reward(task), discount_of(settings.learner)
+    source = data or model
+    if data is None and not (model / "checkpoints").exists():
+        raise RunError(f"{model} holds no judgements: say what to grade it on, with --data FOLDER_OR_FILE")
+    with open_judgements(source, task, which) as (store, _):
+        if data is None:
+            round = json.loads((saved.folder / "loop.json").read_text())["round"]
+            subject = of_run(reward, store, model, round, share, discount)
+        else:
+            judged = judgements(store, share if held_out else None)
+            subject = (
+                Subject(reward, judged, (), discount, model.resolve().name, source.name, held_out) if judged else None
+            )
+        if subject is None:
+            raise RunError(f"{source}: no judgement is held out that the reward model could be graded on")
+        if rewardbench is not None:
+            _write_rewardbench(subject, rewardbench)
+        return grade(subject, rng)
+
+
+def _write_rewardbench(subject: Subject, folder: Path) -> None:
+    """Every pair in which one response is preferred, with the scores of both."""
+    from prefrl.reward_models.io import ScoredPair, write_rewardbench
+
+    pairs, rows = batch(subject.judged), []
+    if not all(isinstance(c, Response) for c in pairs.candidates):
+        raise RunError("RewardBench knows pairs of texts: segments of control cannot be written for it")
+    scores = subject.reward.score(pairs.candidates)
+    for number, ((first, second), preference) in enumerate(zip(pairs.edges, pairs.preference, strict=True)):
+        best, worst = (first, second) if preference > 0.5 else (second, first)
+        chosen, rejected = (pairs.candidates[i].prompt + pairs.candidates[i].text for i in (best, worst))
+        if preference != 0.5:
+            rows.append(ScoredPair(number, subject.data, chosen, rejected, float(scores[best]), float(scores[worst])))
+    write_rewardbench(folder, subject.model, rows)
+
+
+def write_card(card: ReportCard, data: Path | None, page: Path | None) -> None:
+    """Write a report card as JSON, as a page, or both."""
+    if data is not None:
+        write_file(data, card.model_dump_json(indent=1).encode())
+    if page is not None:
+        write_file(page, render_card(card).encode())
 
 
 def shrink(config: Config) -> Config:

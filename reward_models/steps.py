@@ -260,8 +260,9 @@ class StepReward:
 
 def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     """The mean and std of each input; a constant has std 1."""
-    mean = steps.mean(0)
-    std = (steps - mean).square_().mean(0).sqrt()  # several times faster than Tensor.std over the first axis
+    each = torch.full((1, len(steps)), 1 / len(steps))  # products are several times faster than mean and std over rows
+    mean = (each @ steps)[0]
+    std = (each @ (steps - mean).square_())[0].sqrt()
     return mean, torch.where(std > 1e-6, std, 1.0)
 
 

@@ -54,6 +54,39 @@ def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
     assert "5 of 5" in prefrl.out
 
 
+def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgements(prefrl: Shell) -> None:
+    assert prefrl("run control/toy --out run") == 0
+    at_the_end = json.loads(Path("run/card.json").read_text())
+    assert "How good is the reward model?" in Path("run/report.html").read_text("utf-8")
+    assert prefrl("evaluate --reward run --json card.json --html card.html") == 0
+    assert "held-out comparisons" in prefrl.out
+    again = json.loads(Path("card.json").read_text())
+    again["seconds"] = at_the_end["seconds"]  # the only thing that two times differ in
+    assert again == at_the_end
+    assert "<svg" in Path("card.html").read_text("utf-8")
+    assert prefrl("label control/toy loop.labels=40 seed=5 --out labels") == 0
+    assert prefrl("fit labels --out reward fitting.epochs=20") == 0
+    assert prefrl("evaluate --reward reward") == 2
+    assert "--data" in prefrl.err
+    assert prefrl("evaluate --reward run --data labels") == 0
+    assert "40 comparisons (all there are" in prefrl.out
+    assert prefrl("evaluate --reward reward --data labels --held-out --json part.json") == 0
+    assert 0 < json.loads(Path("part.json").read_text())["about"]["judgements"] < 40
+    assert prefrl("evaluate --reward run --rewardbench bench") == 2
+    assert "pairs of texts" in prefrl.err
+    assert prefrl("evaluate") == 2
+
+
+def test_the_scores_of_texts_are_written_as_rewardbench_does(prefrl: Shell) -> None:
+    assert prefrl("label text/toy loop.labels=12 --out labels") == 0
+    assert prefrl("fit labels --out reward") == 0
+    assert prefrl("evaluate --reward reward --data labels --rewardbench bench --json card.json") == 0
+    written = json.loads(Path("bench/eval-set-scores/reward.json").read_text())
+    card = json.loads(Path("card.json").read_text())
+    assert len(written["results"]) == card["accuracy"]["count"]
+    assert card["lengths"]["unit"] == "tokens"
+
+
 def test_the_three_uses_stand_alone_for_text(prefrl: Shell) -> None:
     assert prefrl("label text/toy loop.labels=12 --out labels") == 0
     assert prefrl("export labels --to preferences.jsonl") == 0

@@ -50,6 +50,9 @@ def test_a_run_leaves_the_files_that_the_design_names(name: str, tmp_path: Path)
         run.report()
     found = {p.name for p in folder.iterdir()}
     assert found >= {"config.yaml", "metrics.jsonl", "summary.json", "store.db", "report.html", "checkpoints", "gold"}
+    rows = [json.loads(line) for line in (folder / "probes.jsonl").read_text().splitlines()]
+    assert [row["round"] for row in rows] == list(range(1, config.loop.rounds + 1))
+    assert {len(row["scores"]) for row in rows} == {len(rows[0]["candidates"])}
     assert any("tfevents" in f for f in found)
     assert ("blobs" in found) == name.startswith("control")
     summary = json.loads((folder / "summary.json").read_text())
@@ -70,6 +73,7 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(name: str, tmp_path
         assert [r.number for r in run] == list(range(2, run.config.loop.rounds + 1))
     assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
     assert numbers(tmp_path / "parts") == numbers(tmp_path / "whole")
+    assert (tmp_path / "parts/probes.jsonl").read_bytes() == (tmp_path / "whole/probes.jsonl").read_bytes()
 
 
 DYING = """
@@ -137,6 +141,7 @@ def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(
     finish(name, tmp_path / "killed")
     assert weights(tmp_path / "killed") == weights(whole(name))
     assert numbers(tmp_path / "killed") == numbers(whole(name))
+    assert (tmp_path / "killed/probes.jsonl").read_bytes() == (whole(name) / "probes.jsonl").read_bytes()
     with Store[Any](tmp_path / "killed", write=False) as a, Store[Any](whole(name), write=False) as b:
         assert a.answers() == b.answers()
 

@@ -63,6 +63,19 @@ class Line:
     """Half the height of a band around the curve, or nothing."""
 
 
+@dataclass(frozen=True)
+class Bar:
+    """A share of some comparisons."""
+
+    label: str
+    share: float | None
+    low: float | None
+    high: float | None
+    count: int
+    beside: float | None = None
+    """Another share of the same comparisons, drawn as a diamond."""
+
+
 def lines(
     name: str, rounds: Sequence[int], curves: Sequence[Line], percent: bool = False, zero: bool = False
 ) -> Markup:
@@ -126,6 +139,45 @@ def reliability(name: str, bins: Sequence[Bin]) -> Markup:
         counts.set_xlabel("confidence in the favourite")
 
     return _svg(name, draw) if bins else Markup("")
+
+
+def bars(name: str, found: Sequence[Bar], label: str) -> Markup:
+    """Shares side by side with their intervals, and how many comparisons each rests on; empty without bars."""
+    kept = [bar for bar in found if bar.share is not None]
+    x, y = np.arange(len(kept)), np.array([bar.share for bar in kept], float)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.bar(x, y, 0.66, color=COLOURS["learned"], alpha=0.45)
+        axes.axhline(0.5, color=COLOURS["muted"], linewidth=1.2, linestyle=(0, (4, 3)))
+        for at, bar in zip(x, kept, strict=True):
+            if bar.low is not None and bar.high is not None:
+                axes.vlines(at, bar.low, bar.high, color=COLOURS["learned"], linewidth=1.6)
+            axes.annotate(str(bar.count), (at, 0), (0, 3), textcoords="offset points", ha="center")
+        beside = [(at, bar.beside) for at, bar in zip(x, kept, strict=True) if bar.beside is not None]
+        if beside:
+            axes.plot(*zip(*beside, strict=True), "D", color=COLOURS["ink"], markersize=5, label="the longer one wins")
+            _legend(axes, 1)
+        axes.set_ylim(0, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.grid(visible=False, axis="x")
+        axes.set_xticks(x, [bar.label for bar in kept], fontsize=9)
+        axes.set_xlabel(label)
+
+    return _svg(name, draw) if kept else Markup("")
+
+
+def scatter(name: str, x: Sequence[float], y: Sequence[float], labels: tuple[str, str], colour: str) -> Markup:
+    """A dot for each candidate; empty with under three."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.scatter(x, y, s=16, color=COLOURS[colour], alpha=0.5, linewidths=0)
+        axes.margins(0.05)
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+
+    return _svg(name, draw) if len(x) > 2 and len(x) == len(y) else Markup("")
 
 
 def stacked(name: str, rounds: Sequence[int], seconds: Mapping[str, Series]) -> Markup:

@@ -15,8 +15,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
+from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import Bin, reliability
+from prefrl.evaluate.card import ReportCard
 
 Json: TypeAlias = dict[str, Any]
 MAX_TEXT = 4_000
@@ -58,6 +60,8 @@ class Record:
     """The round of that fit."""
     before: tuple[Example, ...]
     after: tuple[Example, ...]
+    card: ReportCard | None
+    """How good the reward model is, where that was measured."""
     missing: tuple[str, ...]
     """Files that are not there yet, or cannot be read, in words."""
 
@@ -87,6 +91,7 @@ def read(folder: Path) -> Record:
         fitted_round=whole(held_out.get("round")),
         before=_examples(folder / "examples" / "before.json", missing),
         after=_examples(folder / "examples" / "after.json", missing),
+        card=_card(folder / "card.json", missing),
         missing=tuple(missing),
     )
 
@@ -185,6 +190,17 @@ def _reliability(held_out: Json, missing: list[str]) -> tuple[Bin, ...]:
     if len(good) < len(pairs):
         missing.append(f"held_out.json: {len(pairs) - len(good)} comparisons without a usable number are left out")
     return reliability(*np.array(good, np.float64).T) if good else ()
+
+
+def _card(path: Path, missing: list[str]) -> ReportCard | None:
+    """The report card, where there is one."""
+    if not path.is_file():
+        return None
+    try:
+        return ReportCard.model_validate_json(path.read_bytes())
+    except (ValidationError, OSError):
+        missing.append(f"{path.name}: cannot be read")
+        return None
 
 
 def _examples(path: Path, missing: list[str]) -> tuple[Example, ...]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
+from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.card_chapter import grades
 from prefrl.evaluate.chapters import chapters
 from prefrl.evaluate.facts import calibration, gather
-from prefrl.evaluate.records import Record, read
+from prefrl.evaluate.records import Record, read, visible
 from prefrl.evaluate.words import headline, show_count, show_number, show_share, show_time, verdict
 from prefrl.files import write_file
 
@@ -26,18 +29,36 @@ def write_report(folder: Path) -> Path:
 
 
 def render(record: Record) -> str:
-    """The page. All that comes from the folder is escaped; only this package's own figures and style are not."""
-    here = files("prefrl.evaluate")
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"number": show_number, "share": show_share, "time": show_time, "count": show_count}
+    """The page of a run."""
     facts = gather(record)
-    return environment.from_string((here / "report.html").read_text("utf-8")).render(
-        style=Markup((here / "report.css").read_text("utf-8")),
+    return _page(
+        "report.html",
         facts=facts,
         record=record,
         headline=headline(facts),
         verdict=verdict(facts),
         chapters=chapters(record, facts),
         calibration=calibration(record),
+        grades=grades(record.card) if record.card else None,
         timed=sum(facts.seconds.values()),
     )
+
+
+def render_card(card: ReportCard) -> str:
+    """A report card as a page of its own."""
+    return _page("card.html", model=visible(card.about.model, 200), grades=grades(card))
+
+
+def _page(name: str, **values: Any) -> str:
+    """A template filled in. All values are escaped; only this package's own figures and style are not."""
+    here = files("prefrl.evaluate")
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=FunctionLoader(lambda file: (here / file).read_text("utf-8")),
+    )
+    environment.filters |= {"number": show_number, "share": show_share, "time": show_time, "count": show_count}
+    style = Markup((here / "report.css").read_text("utf-8"))
+    return environment.get_template(name).render(style=style, **values)

@@ -130,7 +130,7 @@ def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
 
 
 def cut(rollout: Rollout, length: int, count: int, name: str, rng: np.random.Generator) -> list[Segment]:
-    """`count` distinct segments of a rollout, gold attached, drawn by the weights of `windows`."""
+    """`count` distinct segments of a rollout, oldest first, gold attached, drawn by the weights of `windows`."""
     starts, weights = windows(rollout, length)
     if len(starts) < count:
         raise ValueError(
@@ -138,7 +138,8 @@ def cut(rollout: Rollout, length: int, count: int, name: str, rng: np.random.Gen
             "were asked for; lower loop.pool or the segment length, or raise learner.steps_per_round"
         )
     chosen = rng.choice(len(starts), count, replace=False, p=weights / weights.sum())
-    return [segment(rollout, int(env), int(t), length, name) for env, t in starts[chosen]]
+    by_time = starts[chosen][np.argsort(starts[chosen, 1], kind="stable")]
+    return [segment(rollout, int(env), int(t), length, name) for env, t in by_time]
 
 
 def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segment:

@@ -2,114 +2,134 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Generic, Literal
 
 import numpy as np
 from pydantic import Field
 
 from prefrl.components import Settings
-from prefrl.protocols import RewardModel
-from prefrl.types import C, Candidate, Floats, Query, Segment
+from prefrl.protocols import RewardModel, Selector
+from prefrl.sample.acquisition import SCORES, joint_information
+from prefrl.sample.diversity import dpp, k_center, k_medoids
+from prefrl.sample.queries import asked, disjoint, groups, newest, proposals, query_features, topped_up
+from prefrl.types import C, Floats, Integers, Query
 
 
-def overlap(a: Candidate, b: Candidate) -> bool:
-    """Whether two segments share steps of one episode; responses never do."""
-    if not (isinstance(a, Segment) and isinstance(b, Segment)) or a.episode != b.episode:
-        return False
-    return a.start < b.start + len(b) and b.start < a.start + len(a)
+class UnscoredSettings(Settings):
+    """Ask without a look at what the reward model predicts; both kinds work before the first fit."""
 
-
-def groups(pool: Sequence[C], size: int, rng: np.random.Generator) -> list[Query[C]]:
-    """Disjoint random queries of `size` candidates of one context each, in random order.
-
-    A candidate stands in at most one query, so that no query repeats or half-repeats another, and never beside one
-    that it overlaps: what they share says nothing. Candidates left without enough others are dropped.
-    """
-    by_context: dict[str, list[C]] = defaultdict(list)
-    for candidate in {c.id: c for c in pool}.values():
-        by_context[candidate.context].append(candidate)
-    found: list[Query[C]] = []
-    for members in by_context.values():
-        found += _first_fit([members[i] for i in rng.permutation(len(members))], size)
-    return [found[i] for i in rng.permutation(len(found))]
-
-
-def _first_fit(members: Sequence[C], size: int) -> list[Query[C]]:
-    """Each candidate joins the first open group without one that it overlaps, else it opens a group."""
-    found: list[Query[C]] = []
-    opened: list[list[C]] = []  # few: whoever opened the newest overlaps a member of each
-    for candidate in members:
-        fits = (i for i, group in enumerate(opened) if not any(overlap(candidate, other) for other in group))
-        at = next(fits, len(opened))
-        if at == len(opened):
-            opened.append([])
-        opened[at].append(candidate)
-        if len(opened[at]) == size:
-            found.append(Query(tuple(opened.pop(at))))
-    return found
-
-
-class UniformSettings(Settings):
-    """Ask about candidates drawn at random."""
-
-    kind: Literal["uniform"] = "uniform"
+    kind: Literal["uniform", "coverage"] = "uniform"
+    """At random, or about queries that are far from one another (greedy k-center)."""
     candidates: int = Field(2, ge=2, le=8)
     """K: how many candidates a query puts side by side."""
+    newest: float = Field(1.0, gt=0, le=1)
+    """The share of the pool, from its end where the newest are, that may be asked about."""
 
-    def build(self) -> Uniform[C]:
-        return Uniform(self)
+    def build(self) -> Selector[C]:
+        return Coverage(self) if self.kind == "coverage" else Uniform(self)
 
 
 @dataclass(frozen=True)
 class Uniform(Generic[C]):
     """Draws queries at random."""
 
-    settings: UniformSettings
+    settings: UnscoredSettings
 
     def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
-        return groups(pool, self.settings.candidates, rng)[:count]
-
-
-class DisagreementSettings(Settings):
-    """Ask where the members of an ensemble disagree most (Christiano et al. 2017, section 2.2.4)."""
-
-    kind: Literal["disagreement"] = "disagreement"
-    candidates: int = Field(2, ge=2, le=8)
-    """K: how many candidates a query puts side by side."""
-
-    def build(self) -> Disagreement[C]:
-        return Disagreement(self)
+        pool = newest(pool, self.settings.newest)
+        return asked(pool, groups(pool, self.settings.candidates, rng)[:count])
 
 
 @dataclass(frozen=True)
-class Disagreement(Generic[C]):
-    """Draws queries at random, as many as the pool gives, and keeps those with the highest disagreement.
+class Coverage(Generic[C]):
+    """Draws queries at random, as many as the pool gives, and keeps those that lie far from one another.
 
-    Before the first fit the members' disagreement is noise, so the draw is uniform.
+    Distances are between the reward model's features of both candidates. The first query is a random one.
     """
 
-    settings: DisagreementSettings
+    settings: UnscoredSettings
 
     def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
+        pool = newest(pool, self.settings.newest)
         queries = groups(pool, self.settings.candidates, rng)
-        if not reward.fitted or reward.members < 2 or len(queries) <= count:
-            return queries[:count]
-        flat = [candidate for query in queries for candidate in query.candidates]
-        scores = reward.raw_member_scores(flat).reshape(reward.members, len(queries), self.settings.candidates)
-        best = np.argsort(-disagreement(scores), kind="stable")[:count]
-        return [queries[i] for i in best]
+        if len(queries) > count:
+            queries = queries[k_center(query_features(reward.features(pool), queries), count)]
+        return asked(pool, queries)
 
 
-def disagreement(scores: Floats) -> Floats:
-    """(E, Q, K) raw scores -> (Q,): the members' std of the preference probability, averaged over candidate pairs.
+class ScoredSettings(Settings):
+    """Ask where the answer is worth most to an ensemble: information is BALD's (Houlsby et al. 2011)."""
 
-    Raw scores are the logits of the fitted likelihood; settled ones are on another scale, and would saturate.
+    kind: Literal["disagreement", "entropy", "information"] = "disagreement"
+    """The members' spread of the preference probability, the entropy of their mean, or what the answer tells about
+    which member is right."""
+    candidates: int = Field(2, ge=2, le=8)
+    """K: how many candidates a query puts side by side."""
+    newest: float = Field(1.0, gt=0, le=1)
+    """The share of the pool, from its end where the newest are, that may be asked about."""
+    proposals: int = Field(8, ge=1)
+    """In how many possible queries, about, each candidate is tried; at most one of them is asked."""
+    diversify: Literal["none", "k_medoids", "dpp", "batch"] = "none"
+    """How a round's queries are kept from being alike: by their features (k_medoids, or dpp, which weighs in the
+    score), or by what they tell the ensemble together (batch)."""
+    shortlist: int = Field(3, ge=2)
+    """How many times the queries asked for are kept by score, before `diversify` chooses among them."""
+
+    def build(self) -> Scored[C]:
+        return Scored(self)
+
+    def needs_members(self) -> bool:
+        """Whether one member alone has nothing to say."""
+        return self.kind != "entropy" or self.diversify == "batch"
+
+
+@dataclass(frozen=True)
+class Scored(Generic[C]):
+    """Scores many possible queries and asks the best, each candidate at most once.
+
+    Before the first fit scores are noise, and with one member nothing disagrees: the draw is then uniform.
     """
-    pairs = combinations(range(scores.shape[2]), 2)
-    spread = [(0.5 + 0.5 * np.tanh((scores[:, :, i] - scores[:, :, j]) / 2)).std(0) for i, j in pairs]
-    mean: Floats = np.mean(spread, axis=0)
-    return mean
+
+    settings: ScoredSettings
+
+    def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
+        settings, pool = self.settings, newest(pool, self.settings.newest)
+        if not reward.fitted or (reward.members < 2 and settings.needs_members()):
+            return asked(pool, groups(pool, settings.candidates, rng)[:count])
+        queries = proposals(pool, settings.candidates, settings.proposals, rng)
+        if not len(queries):
+            return []
+        scores = reward.raw_member_scores(pool)[:, queries]
+        values = SCORES[settings.kind](scores)
+        kept = count if settings.diversify == "none" else count * settings.shortlist
+        rows = disjoint(queries, np.argsort(-values, kind="stable"), kept)
+        if len(rows) > count:
+            rows = rows[self._diverse(_Shortlist(pool, reward, queries[rows], scores[:, rows], values[rows]), count)]
+        return asked(pool, topped_up(pool, queries[rows], count, rng))
+
+    def _diverse(self, shortlist: _Shortlist[C], count: int) -> Integers:
+        if self.settings.diversify == "batch":
+            return joint_information(shortlist.scores, count)
+        if self.settings.diversify == "dpp":
+            return dpp(shortlist.features(), shortlist.values, count)
+        return k_medoids(shortlist.features(), count)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shortlist(Generic[C]):
+    """The queries with the highest values, best first."""
+
+    pool: Sequence[C]
+    reward: RewardModel[C]
+    queries: Integers
+    """(Q, K) indices into the pool."""
+    scores: Floats
+    """(E, Q, K) raw scores."""
+    values: Floats
+    """(Q,) what each is worth."""
+
+    def features(self) -> Floats:
+        """(Q, 2 d)."""
+        return query_features(self.reward.features(self.pool), self.queries)

@@ -1,118 +1,167 @@
 from collections.abc import Callable
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
 
-from prefrl.sample.select import DisagreementSettings, UniformSettings, disagreement, groups, overlap
-from prefrl.types import Response, Segment
+from prefrl.components import TABLE, settings_class
+from prefrl.sample.acquisition import information
+from prefrl.sample.queries import overlap
+from prefrl.sample.select import ScoredSettings, UnscoredSettings
+from prefrl.types import Floats, Response, Segment
+
+KINDS = ["uniform", "coverage", "disagreement", "entropy", "information"]
+DIVERSE = ["none", "k_medoids", "dpp", "batch"]
+SCORED = ["disagreement", "entropy", "information"]
+ALL = [{"kind": k} for k in KINDS] + [{"kind": k, "diversify": d} for k in SCORED for d in DIVERSE[1:]]
 
 
 class Fake:
-    """A reward model whose members agree on candidates called "sure"."""
+    """A reward model whose members agree on candidates called "sure", and who put "unsure" in opposite orders."""
 
-    members, fitted = 2, True
+    members, fitted, calls = 2, True, 0
 
-    def raw_member_scores(self, candidates: list[Response]) -> np.ndarray:
+    def raw_member_scores(self, candidates: list[Response]) -> Floats:
+        self.calls += 1
         first = np.array([len(c.text) for c in candidates], float)
         second = np.array([len(c.text) * (1 if c.prompt == "sure" else -1) for c in candidates], float)
-        return np.stack([first, second])
+        return np.stack([first, second])[: self.members]
 
-
-class Settled(Fake):
-    """Its settled scores are on a scale on which the members seem to disagree about "sure" the most."""
-
-    def member_scores(self, candidates: list[Response]) -> np.ndarray:
+    def member_scores(self, candidates: list[Response]) -> Floats:
+        """Settled scores are on a scale on which the members seem to disagree about "sure" the most."""
         signs = np.array([1.0 if c.prompt == "sure" else 0.0 for c in candidates])
-        scores: np.ndarray = np.stack([signs, -signs]) * 1000.0 * np.array([len(c.text) for c in candidates])
+        scores: Floats = np.stack([signs, -signs]) * 1000.0 * np.array([len(c.text) for c in candidates])
         return scores
 
+    def features(self, candidates: list[Response]) -> Floats:
+        return np.array([[len(c.text), c.prompt == "sure"] for c in candidates], np.float32)
 
-def dense(episodes: int, count: int, steps: int = 10) -> list[Segment]:
-    """Segments that start at every step of a few short episodes."""
-    filled = np.zeros((steps, 1), np.float32)
-    return [Segment(filled, filled, f"round 0/{e}/0", start) for e in range(episodes) for start in range(count)]
+
+class Looking:
+    """A reward model of segments: three members, each looking at one coordinate of the first observation."""
+
+    members, fitted = 3, True
+
+    def raw_member_scores(self, candidates: list[Segment]) -> Floats:
+        return 3 * self.features(candidates).T
+
+    def features(self, candidates: list[Segment]) -> Floats:
+        return np.stack([c.observations[0, :3] for c in candidates])
+
+
+def build(**settings: Any) -> Any:
+    return settings_class("selectors", settings["kind"]).model_validate(settings).build()  # type: ignore[attr-defined]
 
 
 def responses(prompt: str, count: int) -> list[Response]:
     return [Response(prompt, f"{prompt} {'x' * i}") for i in range(count)]
 
 
-def test_queries_are_disjoint_of_one_context_and_of_the_size_asked_for(rng: np.random.Generator) -> None:
-    made = groups(responses("a", 7) + responses("b", 4) + responses("c", 1), 3, rng)
-    assert len(made) == 2 + 1
-    assert all(len({c.prompt for c in q.candidates}) == 1 and len(q.candidates) == 3 for q in made)
-    ids = [c.id for q in made for c in q.candidates]
-    assert len(set(ids)) == len(ids)
+MIXED = responses("sure", 12) + responses("unsure", 12)
 
 
-def test_a_candidate_that_was_sampled_twice_is_not_compared_with_itself(rng: np.random.Generator) -> None:
-    assert groups(responses("a", 2) * 5, 2, rng)[1:] == []
+def test_every_kind_of_the_table_is_known_here() -> None:
+    assert sorted(TABLE["selectors"]) == sorted(KINDS)
+
+
+@pytest.mark.parametrize("settings", ALL, ids=str)
+@pytest.mark.parametrize("size", [2, 3])
+def test_every_selector_asks_what_can_be_compared_each_candidate_once(
+    settings: dict[str, str], size: int, rng: np.random.Generator, make_segment: Callable[..., Segment]
+) -> None:
+    pool = [make_segment() for _ in range(40)]
+    pool += [Segment(c.observations, c.actions, "one", start) for start, c in enumerate(pool[:20])]
+    chosen = build(**settings, candidates=size).select(pool + pool[:5], Looking(), 6, rng)
+    ids = [c.id for q in chosen for c in q.candidates]
+    assert len(ids) == len(set(ids)) == 6 * size
+    assert not any(overlap(a, b) for q in chosen for a, b in combinations(q.candidates, 2))
+
+
+@pytest.mark.parametrize("settings", ALL, ids=str)
+def test_equal_seeds_give_equal_queries(settings: dict[str, str]) -> None:
+    first, second = (build(**settings).select(MIXED, Fake(), 4, np.random.default_rng(7)) for _ in range(2))
+    assert [q.id for q in first] == [q.id for q in second]
+
+
+@pytest.mark.parametrize("settings", ALL, ids=str)
+def test_a_pool_gives_all_it_has_where_more_is_asked(settings: dict[str, str], rng: np.random.Generator) -> None:
+    assert len(build(**settings).select(responses("unsure", 8), Fake(), 10, rng)) == 4
+    assert build(**settings).select(responses("unsure", 1), Fake(), 10, rng) == []
+    assert build(**settings).select([], Fake(), 10, rng) == []
+
+
+@pytest.mark.parametrize("kind", ["disagreement", "information"])
+@pytest.mark.parametrize("diversify", DIVERSE)
+def test_scored_kinds_ask_where_members_differ(kind: str, diversify: str, rng: np.random.Generator) -> None:
+    pool = [*MIXED, *(Response("unsure", "y" * (20 + i)) for i in range(12))]
+    chosen = build(kind=kind, diversify=diversify, shortlist=2).select(pool, Fake(), 3, rng)
+    assert all(q.candidates[0].prompt == "unsure" for q in chosen)
+
+
+def test_disagreement_is_of_the_scores_that_were_fitted_not_of_settled_ones(rng: np.random.Generator) -> None:
+    reward = Fake()
+    chosen = build(kind="disagreement").select(MIXED, reward, 3, rng)
+    assert all(q.candidates[0].prompt == "unsure" for q in chosen)
+    assert reward.calls == 1  # each candidate was scored once
+
+
+@pytest.mark.parametrize("settings", ALL[2:], ids=str)
+def test_before_the_first_fit_scores_are_noise_so_the_draw_is_uniform(settings: dict[str, str]) -> None:
+    reward = Fake()
+    reward.fitted = False
+    chosen = build(**settings).select(MIXED, reward, 3, np.random.default_rng(0))
+    assert chosen == build(kind="uniform").select(MIXED, reward, 3, np.random.default_rng(0))
+
+
+def test_one_member_alone_leaves_the_draw_uniform_unless_its_entropy_is_asked(rng: np.random.Generator) -> None:
+    reward = Fake()
+    reward.members = 1
+    uniform = build(kind="uniform").select(MIXED, reward, 3, np.random.default_rng(0))
+    for settings in ({"kind": "information"}, {"kind": "disagreement"}, {"kind": "entropy", "diversify": "batch"}):
+        assert build(**settings).select(MIXED, reward, 3, np.random.default_rng(0)) == uniform
+    chosen = build(kind="entropy", proposals=30).select(MIXED, reward, 3, rng)
+    assert all(abs(len(a.text) - len(b.text)) == 1 for q in chosen for a, b in [q.candidates])
+
+
+def test_coverage_spreads_out_even_before_the_first_fit(rng: np.random.Generator) -> None:
+    reward = Fake()
+    reward.fitted = False
+    pool = responses("sure", 60) + [Response("unsure", "x" * (500 + i)) for i in range(2)]
+    chosen = build(kind="coverage").select(pool, reward, 2, rng)
+    assert {q.candidates[0].prompt for q in chosen} == {"sure", "unsure"}
+
+
+def test_only_the_newest_share_is_asked_about(rng: np.random.Generator) -> None:
+    for kind in KINDS:
+        chosen = build(kind=kind, newest=0.5).select(MIXED, Fake(), 4, rng)
+        assert {c.prompt for q in chosen for c in q.candidates} == {"unsure"}
 
 
 def test_a_uniform_draw_gives_every_pair_the_same_chance(make_segment: Callable[..., Segment]) -> None:
     pool = [make_segment() for _ in range(4)]
     seen: dict[str, int] = {}
     for seed in range(600):
-        selector: Any = UniformSettings().build()
-        (query,) = selector.select(pool, Fake(), 1, np.random.default_rng(seed))
+        (query,) = build(kind="uniform").select(pool, Fake(), 1, np.random.default_rng(seed))
         seen[query.id] = seen.get(query.id, 0) + 1
     assert len(seen) == 6
     assert all(count == pytest.approx(100, abs=40) for count in seen.values())
 
 
-def test_disagreement_asks_where_members_differ(rng: np.random.Generator) -> None:
-    pool = responses("sure", 8) + responses("unsure", 8)
-    selector: Any = DisagreementSettings().build()
-    chosen = selector.select(pool, Fake(), 3, rng)
-    assert all(q.candidates[0].prompt == "unsure" for q in chosen)
+def test_more_proposals_find_more_informative_queries(make_segment: Callable[..., Segment]) -> None:
+    pool, reward = [make_segment() for _ in range(60)], Looking()
+
+    def found(proposals: int) -> float:
+        selector = build(kind="information", proposals=proposals)
+        chosen = selector.select(pool, reward, 5, np.random.default_rng(0))
+        scores = np.stack([reward.raw_member_scores(list(q.candidates)) for q in chosen], 1)
+        return float(information(scores).mean())
+
+    assert found(12) > found(1)
 
 
-def test_disagreement_is_of_the_scores_that_were_fitted_not_of_settled_ones(rng: np.random.Generator) -> None:
-    selector: Any = DisagreementSettings().build()
-    chosen = selector.select(responses("sure", 8) + responses("unsure", 8), Settled(), 3, rng)
-    assert all(q.candidates[0].prompt == "unsure" for q in chosen)
-
-
-@pytest.mark.parametrize(("episodes", "size"), [(1, 2), (3, 2), (3, 4), (5, 8)])
-def test_segments_that_overlap_are_never_compared(episodes: int, size: int, rng: np.random.Generator) -> None:
-    made = groups(dense(episodes, 60), size, rng)
-    assert len(made) > 0.8 * episodes * 60 / size
-    assert not any(overlap(a, b) for q in made for a, b in combinations(q.candidates, 2))
-    ids = [c.id for q in made for c in q.candidates]
-    assert len(set(ids)) == len(ids)
-
-
-def test_segments_overlap_when_they_share_a_step_of_one_episode() -> None:
-    first, *rest = dense(1, 12)
-    assert [overlap(first, other) for other in rest] == [True] * 9 + [False] * 2
-    assert [overlap(other, first) for other in rest] == [True] * 9 + [False] * 2
-    assert not overlap(*dense(2, 1))
-    assert not any(overlap(a, b) for a, b in pairwise(responses("a", 3)))
-
-
-def test_a_pool_that_only_overlaps_gives_no_queries(rng: np.random.Generator) -> None:
-    assert groups(dense(1, 10), 2, rng) == []
-
-
-def test_what_cannot_overlap_is_grouped_in_the_order_drawn() -> None:
-    pool = responses("a", 11)
-    made = groups(pool, 3, np.random.default_rng(5))
-    rng = np.random.default_rng(5)
-    order, places = rng.permutation(11), rng.permutation(3)
-    expected = [{pool[i].id for i in order[start : start + 3]} for start in (0, 3, 6)]
-    assert [{c.id for c in q.candidates} for q in made] == [expected[i] for i in places]
-
-
-def test_before_the_first_fit_disagreement_draws_uniformly(rng: np.random.Generator) -> None:
-    model, pool = Fake(), responses("sure", 8) + responses("unsure", 8)
-    model.fitted = False
-    by_disagreement: Any = DisagreementSettings().build()
-    uniform: Any = UniformSettings().build()
-    assert by_disagreement.select(pool, model, 3, rng) == uniform.select(pool, model, 3, np.random.default_rng(0))
-
-
-def test_disagreement_is_the_spread_of_the_preference_by_hand() -> None:
-    scores = np.array([[[0.0, 0.0]], [[100.0, -100.0]]])  # one member is undecided, the other is sure
-    np.testing.assert_allclose(disagreement(scores), [0.25])
+def test_settings_say_what_a_kind_cannot_do() -> None:
+    with pytest.raises(ValueError, match="diversify"):
+        UnscoredSettings.model_validate({"kind": "uniform", "diversify": "dpp"})
+    with pytest.raises(ValueError, match="shortlist"):
+        ScoredSettings(shortlist=1)

@@ -1,0 +1,204 @@
+"""What a report card of a reward model says: plain data, as it lies in `card.json`. What is not defined says why."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Number = Annotated[float, Field(ge=-1e15, le=1e15)]
+"""Finite, and of a size that can be drawn."""
+Words = Annotated[str, Field(max_length=1000)]
+Points = Annotated[list[Number], Field(max_length=1000)]
+
+
+class Part(BaseModel):
+    """A part of a card. A file that does not fit is refused as a whole."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Estimate(Part):
+    """A number with its 95 % interval; or no number, and why."""
+
+    value: Number | None = None
+    low: Number | None = None
+    high: Number | None = None
+    count: int = 0
+    """How many comparisons, candidates or steps it rests on."""
+    how: Words = ""
+    """How the interval was made, or why there is none."""
+    why: Words = ""
+    """Why the number itself is not defined."""
+
+
+class Bucket(Part):
+    """Comparisons whose margin lies in a range."""
+
+    low: Number
+    high: Number
+    accuracy: Estimate
+    longer: Estimate | None = None
+    """How often the longer one was preferred, where lengths were looked at."""
+
+
+class ReliabilityBin(Part):
+    """Comparisons of similar confidence; see `calibration.Bin`."""
+
+    count: int
+    confidence: Number
+    share: Number
+    low: Number
+    high: Number
+
+
+class About(Part):
+    """What was graded, on what."""
+
+    model: Words
+    """The folder of the reward model."""
+    data: Words
+    """Where the judgements are from."""
+    held_out: bool
+    """Whether they are the ones that the fit left out; else all judgements of the data."""
+    kind: Words
+    round: int | None = None
+    """The round of the run that the model is from."""
+    members: int
+    judgements: int
+    comparisons: int
+    """Pairs that the judgements imply, ties included."""
+    ties: int
+    candidates: int
+
+
+class Lengths(Part):
+    """Does the reward pay for length?"""
+
+    unit: Words
+    spearman: Estimate
+    pearson: Estimate
+    baseline: Estimate
+    """The accuracy of "the longer one wins" on the same comparisons."""
+    when_longer: Estimate
+    """The model's accuracy where the longer one was preferred."""
+    when_shorter: Estimate
+    buckets: list[Bucket]
+    """By the absolute difference of lengths."""
+
+
+class Calibration(Part):
+    """Does the model know how sure it may be?"""
+
+    log_loss: Estimate
+    brier: Estimate
+    error: Estimate
+    """Expected calibration error."""
+    bins: list[ReliabilityBin]
+    temperatures: Annotated[list[Number], Field(max_length=2)]
+    """Fitted on one half, and on the other; empty where `log_loss_after` says why."""
+    log_loss_after: Estimate
+    """Each half measured with the other half's temperature."""
+    error_after: Estimate
+
+
+class Invariance(Part):
+    """Largest differences where there should be none, on a few probes."""
+
+    swap: Estimate
+    """abs(P(a > b) + P(b > a) - 1), each from a batch of its own."""
+    alone: Estimate
+    """abs difference of scores alone and in one batch."""
+    reversed: Estimate
+    """The same, in one batch and in the batch turned round."""
+    padding: Estimate
+    """The same, of cut candidates alone and beside whole ones."""
+    spread: Number
+    """The standard deviation of the probes' scores, to compare with."""
+    passed: bool
+
+
+class Members(Part):
+    """How far the members of the ensemble agree."""
+
+    accuracy: list[Estimate]
+    unanimous: Estimate
+    """The share of comparisons on which all name the same winner."""
+
+
+class Gold(Part):
+    """Against the task's own, hidden value."""
+
+    accuracy: Estimate
+    """The share of compared pairs whose better one by gold has the higher score."""
+    spearman: Estimate
+    kendall: Estimate
+    buckets: list[Bucket]
+    """The accuracy against what was judged, by the absolute difference of golds."""
+
+
+class Distance(Part):
+    """How far the reward is from gold, step by step: 0 is the same task, 1 the opposite."""
+
+    epic: Estimate
+    direct: Estimate
+    """The Pearson distance on the stored steps, without canonical shaping."""
+    explained: Estimate
+    """R^2 of the regression that stands in for gold between stored steps."""
+    coverage: Words
+
+
+class Drift(Part):
+    """What a refit changed, on fixed candidates."""
+
+    round: int
+    spearman: Estimate
+    """Rank correlation with the round before."""
+    shift: Estimate
+    """Of the mean score, in standard deviations of the round before."""
+
+
+class LabelerPart(Part):
+    """One labeler's judgements beside the model's."""
+
+    name: Words
+    accuracy: Estimate
+    kappa: Estimate
+    """Agreement beyond chance (Cohen 1960)."""
+    gold: Estimate
+    """How often the labeler agrees with gold."""
+    error_rate: Estimate
+    """As the fit estimated it."""
+
+
+class Scatter(Part):
+    """A sample of candidates to draw."""
+
+    score: Points
+    length: Points
+    gold: Points
+    """Empty where there is none."""
+
+
+class ReportCard(Part):
+    """How good a reward model is."""
+
+    about: About
+    accuracy: Estimate
+    by_margin: list[Bucket]
+    """By the absolute value of the model's own logit."""
+    calibration: Calibration
+    lengths: Lengths
+    gold: Gold
+    distance: Distance
+    labelers: list[LabelerPart]
+    members: Members
+    invariance: Invariance
+    drift: list[Drift]
+    seconds: Estimate
+    """To score 1000 candidates."""
+    scatter: Scatter
+
+
+def undefined(why: str) -> Estimate:
+    return Estimate(why=why)
