@@ -43,9 +43,11 @@ class TextsSettings(Settings):
     response_tokens: int = Field(256, ge=2)
     """The most tokens that a response may have, the end token included."""
     layers: int = Field(2, ge=1)
-    """Of the small Llama, as are the next ones."""
+    """Of the small Llama."""
     width: int = Field(64, ge=8)
+    """Of its hidden states."""
     heads: int = Field(4, ge=1)
+    """Of each attention layer."""
     context: int = Field(16_384, ge=64)
     """The most bytes of a prompt and its response together."""
 

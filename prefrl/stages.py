@@ -71,6 +71,8 @@ def _responses(row: Any) -> list[Response]:
     prompt, texts = (row.get("prompt"), row.get("responses")) if isinstance(row, dict) else (None, None)
     if not isinstance(prompt, str) or not isinstance(texts, list) or not all(isinstance(t, str) for t in texts):
         raise ValueError(f'expected {{"prompt": string, "responses": [strings]}}, got {row!r}')
+    if len(texts) < 2:
+        raise ValueError(f"a query needs at least 2 responses to compare, got {len(texts)}")
     return [Response(prompt, text) for text in texts]
 
 

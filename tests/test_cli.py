@@ -217,7 +217,7 @@ def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
 
 def test_a_run_that_never_learns_anything_says_so(prefrl: Shell) -> None:
     assert prefrl("run control/toy --out run labeler.tie_within=1e6") == 2
-    assert "nothing to fit: all 60 comparisons are ties" in prefrl.out
+    assert "nothing to fit: all 60 judgements are ties" in prefrl.out
     assert "nothing was learned" in prefrl.err
 
 
