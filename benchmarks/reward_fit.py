@@ -3,11 +3,11 @@
     python benchmarks/reward_fit.py [--short] [--peers .venv-peers-control/bin/python]
 
 500 pairs of segments of 100 steps (HalfCheetah's sizes: 17 observations, 6 actions), one epoch in minibatches of 32
-pairs, AdamW, the same network (32x32, 64x64, 256x256x256; ReLU, imitation's default), one thread. imitation's `BasicRewardTrainer` with
-its `CrossEntropyRewardLoss` gets the pairs in its own dataset, ready made; ours gets judgements, and everything from
-them on counts: batching, stacking, the split's graph, the epoch, normalisation and the measured losses. Sides take
-turns in one process group; medians of the repetitions. `ratio` is peer / ours at width 32. `ensemble` is our time
-for three members at width 64 over that for one; both are timed in turns.
+pairs, AdamW, the same network (32x32, 64x64, 256x256x256; ReLU, imitation's default), one thread. imitation's
+`BasicRewardTrainer` with its `CrossEntropyRewardLoss` gets the pairs in its own dataset, ready made; ours gets
+judgements, and everything from them on counts: batching, stacking, the split's graph, the epoch, normalisation and
+the measured losses. Sides take turns in one process group; CPU seconds, medians of the repetitions. `ratio` is
+peer / ours at width 32. `ensemble` is our time for three members at width 64 over that for one, in turns as well.
 """
 
 from __future__ import annotations
@@ -161,9 +161,7 @@ def peer() -> Any:
 
     def run(width: str) -> float:
         torch.manual_seed(0)
-        net = BasicRewardNet(
-            observation_space, action_space, use_next_state=False, hid_sizes=WIDTHS[width]
-        )
+        net = BasicRewardNet(observation_space, action_space, use_next_state=False, hid_sizes=WIDTHS[width])
         loss = pc.CrossEntropyRewardLoss()
         trainer = pc.BasicRewardTrainer(
             pc.PreferenceModel(net), loss, rng=np.random.default_rng(0), epochs=1, batch_size=MINIBATCH, lr=RATE

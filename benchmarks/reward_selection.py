@@ -112,7 +112,9 @@ def run(cases: Sequence[Case], selectors: dict[str, dict[str, Any]], seeds: int,
     """Every curve that the CSV does not hold yet; each is added whole."""
     for case in cases:
         done = {(row["task"], row["selector"], int(row["seed"])) for row in read(out)}
-        todo = [(n, s) for s in range(FIRST_SEED, FIRST_SEED + seeds) for n in selectors if (case.preset, n, s) not in done]
+        todo = [
+            (n, s) for s in range(FIRST_SEED, FIRST_SEED + seeds) for n in selectors if (case.preset, n, s) not in done
+        ]
         bench = prepare(case) if todo else None
         for name, seed in todo:
             assert bench is not None

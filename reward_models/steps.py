@@ -105,7 +105,7 @@ class StepReward:
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         inputs, mask = stacked["inputs"], stacked["mask"]
         if self.memory == 1:
-            outputs = self._pointwise(inputs.flatten(0, 1)).view(self.members, *mask.shape)
+            outputs = self._outputs(inputs.flatten(0, 1), np.zeros(0)).view(self.members, *mask.shape)
         elif mask.shape[1] <= self.memory:
             outputs = self.network.outputs(inputs)
         else:
@@ -122,24 +122,22 @@ class StepReward:
         outputs = self._outputs(real, begins)
         self._shift, self._scale = outputs.mean(1), outputs.std(1, correction=0).clamp(min=1e-6)
         self._temperature, self._fits = 1.0, self._fits + 1
-        sums = np.add.reduceat(outputs.numpy(), np.flatnonzero(begins), -1)
-        return torch.from_numpy(sums) * self._gain
+        return torch.from_numpy(_sums(outputs.numpy(), np.flatnonzero(begins))) * self._gain
 
     def calibrate(self, temperature: float) -> None:
         self._temperature = temperature
 
     def raw_member_scores(self, candidates: Sequence[Segment]) -> Floats:
-        outputs = self._of(candidates, self._outputs)
-        raw: Floats = _sums(outputs, candidates) * np.float32(self._gain / self._temperature)
-        return raw
+        sums = _sums(self._of(candidates, self._outputs), _starts(candidates))
+        return sums * np.float32(self._gain / self._temperature)
 
     def member_scores(self, candidates: Sequence[Segment]) -> Floats:
-        return _sums(self._of(candidates, self._member_rewards), candidates)
+        return _sums(self._of(candidates, self._member_rewards), _starts(candidates))
 
     def score(self, candidates: Sequence[Segment]) -> Floats:
         """(N,) sums of the steps' rewards: members are put together at each step, as in `rewards`."""
         rewards = self._of(candidates, self._member_rewards)
-        return _sums(combine(rewards, self._ensemble, self._fits), candidates)
+        return _sums(combine(rewards, self._ensemble, self._fits), _starts(candidates))
 
     @torch.no_grad()
     def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
@@ -199,14 +197,10 @@ class StepReward:
 
     def _outputs(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
         """(S, I) normalised steps of pieces that start where `begins` (S,) says -> (E, S): before shift and scale."""
-        if self.memory == 1:
-            return self._pointwise(inputs)
-        return looking_back(self.network.outputs, inputs, begins, self.memory, _most(inputs))
-
-    def _pointwise(self, inputs: Tensor) -> Tensor:
-        """(S, I) -> (E, S), of a network that sees one step at a time."""
-        parts = [self.network.outputs(x[:, None])[:, :, 0] for x in torch.split(inputs, _most(inputs))]
-        return torch.cat(parts, 1)
+        most = max(1, min(STEPS, NUMBERS // inputs.shape[1]))
+        if self.memory > 1:
+            return looking_back(self.network.outputs, inputs, begins, self.memory, most)
+        return torch.cat([self.network.outputs(x[:, None])[:, :, 0] for x in torch.split(inputs, most)], 1)
 
     def _normalised(self, steps: Tensor) -> Tensor:
         return (steps - self._input_mean).div_(self._input_std)
@@ -278,10 +272,6 @@ def control(task: Task, kind: str) -> ControlTask:
     return task  # type: ignore[return-value]
 
 
-def _most(inputs: Tensor) -> int:
-    return max(1, min(STEPS, NUMBERS // inputs.shape[1]))
-
-
 def _flat(inputs: Tensor, mask: Tensor) -> tuple[Tensor, np.ndarray]:
     """The real steps (S, I) of padded candidates, and where candidates begin (S,)."""
     real = mask.bool()
@@ -296,7 +286,7 @@ def _starts(candidates: Sequence[Segment]) -> np.ndarray:
     return np.cumsum([0, *(len(c) for c in candidates[:-1])])
 
 
-def _sums(steps: Floats, candidates: Sequence[Segment]) -> Floats:
-    """(..., S) values of the steps of N candidates -> (..., N) sums."""
-    sums: Floats = np.add.reduceat(steps, _starts(candidates), -1)
+def _sums(steps: Floats, starts: np.ndarray) -> Floats:
+    """(..., S) values of the steps of N candidates that start there -> (..., N)."""
+    sums: Floats = np.add.reduceat(steps, starts, -1)
     return sums

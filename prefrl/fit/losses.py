@@ -29,7 +29,9 @@ def choice(scores: Tensor, target: Tensor, error: Tensor | float = 0.0) -> Tenso
     `error`: see `with_errors`.
     """
     log_p = scores.log_softmax(-1)
-    return cross_entropy(with_errors(log_p, error, scores.isfinite().sum(-1, keepdim=True)), target)
+    if isinstance(error, Tensor) or error:
+        log_p = with_errors(log_p, error, scores.isfinite().sum(-1, keepdim=True))
+    return cross_entropy(log_p, target)
 
 
 def davidson(scores: Tensor, target: Tensor, tied: Tensor, tie: Tensor, error: Tensor | float = 0.0) -> Tensor:
@@ -91,7 +93,9 @@ def with_errors(log_p: Tensor, error: Tensor | float, outcomes: Tensor | int) ->
 
 def cross_entropy(log_p: Tensor, target: Tensor) -> Tensor:
     """(E, S, K) and (S, K) -> (E, S). What has no target may be impossible."""
-    return -(target * log_p.masked_fill(target == 0, 0.0)).sum(-1)
+    if log_p.shape[-1] > 2:
+        log_p = log_p.masked_fill(target == 0, 0.0)
+    return -(target * log_p).sum(-1)
 
 
 def weighted_mean(losses: Tensor, weight: Tensor) -> Tensor:
