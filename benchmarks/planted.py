@@ -19,13 +19,18 @@ class Task:
     observation_size, action_size = OBSERVATION, ACTION
 
 
+STEEPNESS = {"linear": 1.0, "network": 1.0, "steep network": 2.1}
+"""Standard deviation of what goes into a hidden unit: at 1 a tanh begins to bend, at 2 it saturates."""
+
+
 class Planted:
     """A random reward over (observation, action), linear or a tanh network with one hidden layer."""
 
     def __init__(self, form: str, rng: np.random.Generator) -> None:
         size = OBSERVATION + ACTION
         self.linear = form == "linear"
-        self.first = rng.normal(size=(size, size if self.linear else HIDDEN)) * 1.5 / np.sqrt(size)
+        each = STEEPNESS[form] / np.sqrt(2 * size)  # inputs have variance 2
+        self.first = rng.normal(size=(size, size if self.linear else HIDDEN)) * each
         self.last = rng.normal(size=self.first.shape[1]) / np.sqrt(self.first.shape[1])
 
     def score(self, segment: Segment) -> float:

@@ -3,7 +3,7 @@
     python benchmarks/reward_labelers.py [--short] [--seeds N]
 
 Each labeler compares 400 pairs of their own: nobody sees a pair that somebody else sees. The reward is that of a
-network. Three fits of the same model by the same settings: on everybody with `fitting.reliability=learned`, on
+steep network. Three fits of the same model by the same settings: on everybody with `fitting.reliability=learned`, on
 everybody with all labelers alike, and on the good labelers alone. `ours` is the mean accuracy on fresh pairs of the
 first, `peer` that of the last; `ratio` compares them. `worst_error` is the largest distance from an estimated to a
 true error rate; the target is 0.05, and 0.02 for the accuracy.
@@ -57,7 +57,7 @@ def main() -> None:
 
 def run(seed: int) -> dict[str, float]:
     rng = np.random.default_rng(seed)
-    planted = Planted("network", rng)
+    planted = Planted("steep network", rng)
     judged = [one for name, rate in RATES.items() for one in compare(planted, 400, rate, name, rng)]
     wrong = {name: np.mean([_wrong(one, planted) for one in judged if one.judgement.labeler == name]) for name in RATES}
     good = [one for one in judged if RATES[one.judgement.labeler] < 0.5]

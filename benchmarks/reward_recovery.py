@@ -5,7 +5,7 @@
 A linear reward and one of a network are planted; an ensemble of three MLPs is fitted by the settings below, which are
 the same for both. `ours` is the smallest correlation with the planted scores on 2,000 fresh segments over all seeds
 and both rewards, with right labels, and `with_mistakes` the same with 30 % wrong ones. There is no peer: `peer` holds
-the targets, 0.99 and 0.95.
+the targets, 0.99 and 0.95. A network whose units saturate is harder; what becomes of it is reported beside them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
 
 MISTAKES = 0.3
-RIGHT = FittingSettings(epochs=60, patience=10, weight_decay="adaptive")
+FORMS = ("linear", "network", "steep network")
+RIGHT = FittingSettings(epochs=100, patience=20, learning_rate=3e-3, held_out=0.1, bootstrap=False)
 NOISY = RIGHT.model_copy(update={"error_rate": 2 * MISTAKES})  # wrong is half of blind
 
 
@@ -31,24 +32,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    found: dict[float, list[float]] = {0.0: [], MISTAKES: []}
+    every: dict[tuple[str, float], list[float]] = {(form, m): [] for form in FORMS for m in (0.0, MISTAKES)}
     for seed in range(1 if options.short else options.seeds):
-        for form in ("linear", "network"):
-            for mistakes, correlations in found.items():
-                correlations.append(run(form, mistakes, seed))
-                print(f"{form} reward, {mistakes:.0%} mistakes, seed {seed}: {correlations[-1]:.4f}", flush=True)
+        for (form, mistakes), correlations in every.items():
+            correlations.append(round(run(form, mistakes, seed), 4))
+            print(f"{form} reward, {mistakes:.0%} mistakes, seed {seed}: {correlations[-1]}", flush=True)
+    found = {m: every["linear", m] + every["network", m] for m in (0.0, MISTAKES)}
     print(
         json.dumps(
             {
                 "name": "reward_recovery: correlation with a planted reward, 2,000 comparisons",
                 "unit": "correlation",
-                "ours": round(min(found[0.0]), 4),
+                "ours": min(found[0.0]),
                 "peer": 0.99,
                 "ratio": round(min(found[0.0]) / 0.99, 4),
-                "spread": [round(x, 4) for x in found[0.0]],
-                "with_mistakes": round(min(found[MISTAKES]), 4),
+                "spread": found[0.0],
+                "with_mistakes": min(found[MISTAKES]),
                 "with_mistakes_target": 0.95,
-                "with_mistakes_spread": [round(x, 4) for x in found[MISTAKES]],
+                "with_mistakes_spread": found[MISTAKES],
+                "steep": every["steep network", 0.0],
+                "steep_with_mistakes": every["steep network", MISTAKES],
                 "equal_work": True,
                 "short": options.short,
             }

@@ -194,7 +194,7 @@ def export_(
     if form is Form.classifier:
         from prefrl.stages import export_classifier
 
-        say(f"{to}: its logit + {export_classifier(store, to):.6g} is the mean of the reward's members")
+        say(f"{to}: its logit, shifted by {export_classifier(store, to):+.6g}, is the mean of the reward's members")
         return
     from prefrl.label.exchange import export_bundle, export_preferences
     from prefrl.store import Store

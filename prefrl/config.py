@@ -35,7 +35,7 @@ def _component(role: Role, default: str | None, value: object) -> Settings:
     try:
         return cls.model_validate(value)
     except ValidationError as error:
-        raise ConfigError("\n".join(_explain(cls, one) for one in error.errors())) from None
+        raise ConfigError("\n".join(_explained(cls, error.errors()))) from None
 
 
 class Config(Settings):
@@ -79,7 +79,7 @@ class Config(Settings):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            lines = [line for one in error.errors() for line in _explain(cls, one).splitlines()]
+            lines = [line for told in _explained(cls, error.errors()) for line in told.splitlines()]
             raise ConfigError("\n".join(line.removeprefix(".") for line in lines)) from None
 
     def dump(self) -> str:
@@ -168,6 +168,24 @@ def _apply(data: dict[str, Any], override: str) -> None:
     data[last] = value
 
 
+def _explained(cls: type[Settings], errors: Iterable[ErrorDetails]) -> list[str]:
+    """What `_explain` says of each mistake; for a setting of several types pydantic names each, here in one line."""
+    found: dict[tuple[int | str, ...], list[ErrorDetails]] = {}
+    for error in errors:
+        *parents, last = error["loc"] or ("",)
+        branch = isinstance(last, str) and ("-" in last or "[" in last)  # as in weight_decay.constrained-float
+        found.setdefault(tuple(parents) if branch else error["loc"], []).append(error)
+    for loc, alternatives in found.items():
+        if len(alternatives) > 1:
+            expected = " or ".join(dict.fromkeys(map(_expected, alternatives)))
+            alternatives[:] = [{**alternatives[0], "type": "union", "loc": loc, "msg": expected}]
+    return [_explain(cls, one) for alternatives in found.values() for one in alternatives]
+
+
+def _expected(error: ErrorDetails) -> str:
+    return error["msg"].removeprefix("Input should be ").removeprefix("a valid ").split(", unable")[0]
+
+
 def _explain(cls: type[Settings], error: ErrorDetails) -> str:
     """One line a mistake: `.dotted.path: what was expected, what came`."""
     path = "".join(f".{part}" for part in error["loc"])
@@ -180,8 +198,7 @@ def _explain(cls: type[Settings], error: ErrorDetails) -> str:
     if error["type"] == "value_error":
         inner = str(error["ctx"]["error"])
         return "\n".join(f"{path}{line if line[:1] in '.:' else ': ' + line}" for line in inner.splitlines())
-    expected = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-    return f"{path}: expected {expected}, got {error['input']!r}"
+    return f"{path}: expected {_expected(error)}, got {error['input']!r}"
 
 
 def _fields(cls: type[Settings], parents: Iterable[str]) -> list[str]:

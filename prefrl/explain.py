@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic.fields import FieldInfo
@@ -39,10 +40,19 @@ def explain(name: str | None) -> list[RenderableType]:
 
 
 def _component(title: str, cls: type[Settings]) -> list[RenderableType]:
-    rows = [(name, _type(field), _default(field), field.description or "") for name, field in cls.model_fields.items()]
     intro = Text((cls.__doc__ or "").strip())
-    shown = table(title, ("setting", "type", "default", "meaning"), rows)
+    shown = table(title, ("setting", "type", "default", "meaning"), list(_rows(cls)))
     return [intro, Text(), shown, *(_formula(cls()) if _has_defaults(cls) else [])]
+
+
+def _rows(cls: type[Settings], group: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """A row for each setting; those of a group are told one by one, as `group.name`."""
+    for name, field in cls.model_fields.items():
+        inner: Any = field.annotation
+        if isinstance(inner, type) and issubclass(inner, Settings):
+            yield from _rows(inner, f"{group}{name}.")
+        else:
+            yield group + name, _type(field), _default(field), field.description or ""
 
 
 def _yaml(config: Config) -> Text:
@@ -64,13 +74,13 @@ def _has_defaults(cls: type[Settings]) -> bool:
 
 def _type(field: FieldInfo) -> str:
     """The type in words, with its bounds."""
-    annotation: Any = field.annotation
-    choices = get_args(annotation)
-    if choices and choices[-1] is Ellipsis:
-        return f"list of {_plain(choices[0])}"
-    name = getattr(annotation, "__name__", None) if not choices else " | ".join(_plain(c) for c in choices)
-    bounds = [f"{SIGNS[type(m)]} {next(iter(vars_of(m)))}" for m in field.metadata if type(m) in SIGNS]
-    return ", ".join([name or str(annotation), *bounds])
+    return ", ".join([_plain(field.annotation), *_bounds(field.metadata)])
+
+
+def _bounds(metadata: Iterable[Any]) -> list[str]:
+    """Such as "≥ 0", of bare constraints and of those inside a `Field`."""
+    inside = [m for given in metadata for m in (given.metadata if isinstance(given, FieldInfo) else [given])]
+    return [f"{SIGNS[type(m)]} {next(iter(vars_of(m)))}" for m in inside if type(m) in SIGNS]
 
 
 def vars_of(bound: Any) -> list[Any]:
@@ -79,8 +89,16 @@ def vars_of(bound: Any) -> list[Any]:
 
 
 def _plain(choice: Any) -> str:
+    """A type, or one of the values it may have, in words."""
+    inner = get_args(choice)
     if choice is type(None):
         return "null"
+    if get_origin(choice) is Annotated:
+        return " ".join([_plain(inner[0]), *_bounds(inner[1:])])
+    if get_origin(choice) is tuple:
+        return f"list of {_plain(inner[0])}" if inner[-1] is Ellipsis else f"[{', '.join(map(_plain, inner))}]"
+    if inner:
+        return " | ".join(map(_plain, inner))
     return getattr(choice, "__name__", None) or str(choice)
 
 

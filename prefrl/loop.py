@@ -124,11 +124,14 @@ class Loop(Generic[C]):
     def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
         with self._timed("fit"):
             try:
-                return fit(self.reward, self.store, self.fitting, rng.fit, pool)
+                fitted = fit(self.reward, self.store, self.fitting, rng.fit, pool)
             except NothingToFit as error:  # people may not have answered yet: what is known stays
                 if self.settings.labels:
                     self._notes.append(f"nothing to fit: {error}")
                 return None
+        if self.fitting.held_out and not fitted.metrics["held_out"]:
+            self._notes.append("too few judgements to hold any out: the fit ran all its epochs, and is not measured")
+        return fitted
 
     def _evaluate(self, rng: Streams) -> Evaluation[C]:
         with self._timed("evaluate"):

@@ -146,8 +146,8 @@ def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
                 name, dtype=torch.float32, use_safetensors=True, output_loading_info=True, **where
             )
     except (OSError, ValueError) as error:
-        hint = "" if download else "; only local files are looked at unless reward.download is true"
-        raise ConfigError(f"no model in safetensors could be read from {name!r}{hint}: {error}") from error
+        hint = first_line(error) if download else "only local files are looked at unless reward.download is true"
+        raise ConfigError(f"no model in safetensors could be read from {name!r}: {hint}") from error
     if missing := sorted(k for k in info["missing_keys"] if "pooler" not in k):
         raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
     found: PreTrainedModel = model
@@ -160,8 +160,13 @@ def load_tokenizer(name: str, download: bool) -> PreTrainedTokenizerBase:
             name, local_files_only=not download, trust_remote_code=False
         )
     except (OSError, ValueError) as error:
-        raise ConfigError(f"no tokenizer could be read from {name!r}: {error}") from error
+        raise ConfigError(f"no tokenizer could be read from {name!r}: {first_line(error)}") from error
     return found
+
+
+def first_line(error: Exception) -> str:
+    """What went wrong; the advice that libraries add is for others."""
+    return str(error).strip().partition("\n")[0]
 
 
 def trainable(model: PreTrainedModel, train: Train) -> dict[str, torch.nn.Parameter]:

@@ -163,8 +163,16 @@ def test_a_second_run_into_the_folder_of_another_is_refused(prefrl: Shell) -> No
 def test_every_kind_is_described_with_every_setting_explained(prefrl: Shell, name: str) -> None:
     assert prefrl(f"describe {name}") == 0
     assert "meaning" in prefrl.out
-    for row in re.findall(r"^│ (\w+) +│[^│]*│[^│]*│ *│$", prefrl.out, re.MULTILINE):
+    for row in re.findall(r"^│ ([\w.]+) +│[^│]*│[^│]*│ *│$", prefrl.out, re.MULTILINE):
         assert row == "kind", f"{name}.{row} has no docstring"
+
+
+def test_types_and_grouped_settings_are_told_in_words(prefrl: Shell) -> None:
+    said = {"fitting": "float ≥ 0 | adaptive", "judge": "[str, str]", "mlp": "combine.caution"}
+    for kind, words in said.items():
+        assert prefrl(f"describe {kind}") == 0
+        assert words in prefrl.out
+        assert "Annotated" not in prefrl.out
 
 
 def test_learners_print_what_they_optimise(prefrl: Shell) -> None:

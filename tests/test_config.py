@@ -54,7 +54,8 @@ def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:
     [
         ("learner.learning_rat=1", "learner.learning_rat: unknown setting; did you mean 'learning_rate'?"),
         ("learner.learning_rate=-1", "learner.learning_rate: expected greater than 0, got -1"),
-        ("learner.learning_rate=fast", "learner.learning_rate: expected"),
+        ("learner.learning_rate=fast", "learner.learning_rate: expected number, got 'fast'"),
+        ("fitting.weight_decay=adaptiv", "fitting.weight_decay: expected number or 'adaptive', got 'adaptiv'"),
         ("learner.learning_rate=.nan", "learner.learning_rate: expected a finite number, got nan"),
         ("learner.kind=ppoo", "learner.kind: unknown learner kind 'ppoo'; did you mean 'ppo'?"),
         ("loop.lables=3", "loop.lables: unknown setting; did you mean 'labels'?"),

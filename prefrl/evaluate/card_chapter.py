@@ -68,7 +68,7 @@ def _agreement(card: ReportCard) -> tuple[Card, ...]:
             "Accuracy by margin",
             plots.bars("card-margin", _bars(card.by_margin), "margin of the model's logit"),
             "Quarters of the comparisons, from those the model is least sure of to those it is surest of, with 95 % "
-            "intervals. The dashes are a coin.",
+            "intervals. The dashes are a coin; the numbers in the bars count comparisons.",
         ),
         Card(
             "Is it as sure as it may be?",

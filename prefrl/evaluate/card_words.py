@@ -10,6 +10,7 @@ from prefrl.evaluate.records import visible
 from prefrl.evaluate.words import show_count, show_number, show_share, show_time
 
 PERCENT = "\N{NO-BREAK SPACE}%"
+UNDEFINED = "not defined: "
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ def headline(card: ReportCard) -> str:
     if accuracy.value is None:
         return f"All {show_count(about.comparisons)} {which} are ties: there is no winner to name."
     between = interval(accuracy, show_share)
+    between = between.replace(" ", "\N{NO-BREAK SPACE}")  # a heading must not break within an interval
     share = show_share(accuracy.value) + (f" ({between})" if between else "")
     return f"It names the winner of {share} of {show_count(accuracy.count)} {which}."
 
@@ -50,9 +52,11 @@ def groups(card: ReportCard) -> list[tuple[str, list[Row]]]:
 
 
 def _folded(rows: list[Row]) -> list[Row]:
-    """One line where none of the numbers is defined, all for one reason."""
-    same = len(rows) > 1 and not any(row.value for row in rows) and len({row.note for row in rows}) == 1
-    return [Row("nothing to measure", "", rows[0].note)] if same else rows
+    """One line where none of the numbers is defined: each reason is given once."""
+    if len(rows) < 2 or any(row.value for row in rows):
+        return rows
+    reasons = dict.fromkeys(row.note.removeprefix(UNDEFINED) for row in rows)
+    return [Row("nothing to measure", "", UNDEFINED + "; ".join(reasons))]
 
 
 def subject(about: About) -> str:
@@ -65,7 +69,8 @@ def subject(about: About) -> str:
     ]
     where = f"round {about.round}; " if about.round is not None else ""
     which = "held-out" if about.held_out else "all"
-    return f"{where}{which} judgements of {visible(about.data, 200)}: {', '.join(parts)}"
+    told = f"{where}{which} judgements of {visible(about.data, 200)}: {', '.join(parts)}"
+    return told[:1].upper() + told[1:]
 
 
 def span(bucket: Bucket) -> str:
@@ -90,7 +95,7 @@ def _calibration(part: Calibration) -> list[Row]:
         _number("calibration error", part.error),
     ]
     if not part.temperatures:
-        return [*rows, Row("temperature", "", f"not defined: {visible(part.log_loss_after.why)}")]
+        return [*rows, Row("temperature", "", f"{UNDEFINED}{visible(part.log_loss_after.why)}")]
     t = " and ".join(show_number(x) for x in part.temperatures)
     return [
         *rows,
@@ -162,19 +167,19 @@ def _drift(card: ReportCard) -> list[Row]:
 
 def _share(name: str, e: Estimate) -> Row:
     if e.value is None:
-        return Row(name, "", f"not defined: {visible(e.why)}")
+        return Row(name, "", f"{UNDEFINED}{visible(e.why)}")
     return Row(name, show_share(e.value), _note(e, show_share))
 
 
 def _number(name: str, e: Estimate) -> Row:
     if e.value is None:
-        return Row(name, "", f"not defined: {visible(e.why)}")
+        return Row(name, "", f"{UNDEFINED}{visible(e.why)}")
     return Row(name, show_number(e.value), _note(e, show_number))
 
 
 def _tiny(name: str, e: Estimate) -> Row:
     if e.value is None:
-        return Row(name, "", f"not defined: {visible(e.why)}")
+        return Row(name, "", f"{UNDEFINED}{visible(e.why)}")
     return Row(name, f"{e.value:.1e}".replace("-", "−") if e.value else "0", f"n = {e.count}")
 
 

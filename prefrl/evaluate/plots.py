@@ -161,7 +161,7 @@ def bars(name: str, found: Sequence[Bar], label: str) -> Markup:
         axes.set_ylim(0, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         axes.grid(visible=False, axis="x")
-        axes.set_xticks(x, [bar.label for bar in kept], fontsize=9)
+        axes.set_xticks(x, [bar.label.replace(" to ", " to\n") for bar in kept], fontsize=9)  # long ones would touch
         axes.set_xlabel(label)
 
     return _svg(name, draw) if kept else Markup("")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from prefrl.components import ConfigError
 from prefrl.fit import semi
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
 from prefrl.fit.losses import weighted_mean
@@ -62,7 +63,7 @@ class Problem(Generic[C]):
         scores = self.reward.scores(semi.crop(stacked, fitting.crop, order) if fitting.crop else stacked)
         loss = weighted_mean(self.likelihood.losses(part.over(here), scores), weights(part, weight))
         if fitting.reliability == "learned":
-            loss = loss + self.likelihood.prior().sum() / float(self.weight[0].sum())
+            loss = loss + (self.likelihood.prior() / weights(self.train, self.weight).sum(1)).sum()
         if fitting.centre:
             loss = loss + fitting.centre * scores.mean(1).square().sum()
         if len(extra):
@@ -84,9 +85,29 @@ class Problem(Generic[C]):
 def optimise(problem: Problem[C], rng: np.random.Generator) -> int:
     """Descend; returns the epochs run. A reward without parameters is solved for when it settles: 0 epochs."""
     if trainable(problem.reward):
+        _check_flips(problem.fitting)
         return _Descent(problem, rng).run()
+    _check_solved(problem.fitting)
     _alternate(problem)
     return 0
+
+
+def _check_flips(fitting: FittingSettings) -> None:
+    """Raises `ConfigError` where no label could ever seem improbable enough to be turned round."""
+    if fitting.denoise == "flip" and (fitting.error_rate > 0 or fitting.reliability == "learned"):
+        raise ConfigError(
+            "fitting.denoise=flip: with error_rate or reliability=learned no label is improbable enough to be turned "
+            "round; set error_rate=0 and reliability=alike, or denoise=filter"
+        )
+
+
+def _check_solved(fitting: FittingSettings) -> None:
+    """Raises `ConfigError` for settings that change what is fitted from epoch to epoch, or from step to step."""
+    off = {"denoise": "off", "pseudo_labels": 0.0, "crop": 0.0}
+    if given := [f"fitting.{name}" for name, value in off.items() if getattr(fitting, name) != value]:
+        raise ConfigError(
+            f"{', '.join(given)}: this reward is solved for, not descended; leave them out, or use another reward.kind"
+        )
 
 
 class _Descent(Generic[C]):
@@ -133,7 +154,7 @@ class _Descent(Generic[C]):
         problem = self.problem
         if self.fitting.denoise == "off":
             return problem.train, problem.weight
-        sums, counts = per_judgement(problem.train, ensemble_losses(problem, problem.train)[None])
+        sums, counts = per_judgement(problem.train, _beside_ignorance(problem, problem.train)[None])
         pairs = torch.tensor(self.fitting.denoise == "flip") & _is_pair(problem.train, counts)
         verdict, self.discriminator = self.discriminator.judge(sums[0] / counts, pairs)
         return flipped(problem.train, verdict.flip), problem.weight * verdict.keep
@@ -151,8 +172,8 @@ class _Descent(Generic[C]):
 
     def _adapt(self) -> None:
         """More weight decay where the held-out loss is far above the training loss, less where it is near."""
-        ratio = ensemble_loss(self.problem, self.problem.test) / ensemble_loss(self.problem, self.problem.train)
-        factor = DECAY_STEP if ratio > OVERFIT[1] else 1 / DECAY_STEP if ratio < OVERFIT[0] else 1.0
+        test, train = (ensemble_loss(self.problem, part) for part in (self.problem.test, self.problem.train))
+        factor = DECAY_STEP if test > OVERFIT[1] * train else 1 / DECAY_STEP if test < OVERFIT[0] * train else 1.0
         group, (least, most) = self.optimizer.param_groups[0], DECAY_BOUNDS
         group["weight_decay"] = min(max(group["weight_decay"] * factor, least), most)
 
@@ -215,8 +236,17 @@ def ensemble_loss(problem: Problem[C], part: Terms, scores: Tensor | None = None
     return float((ensemble_losses(problem, part, scores) * weight).sum() / weight.sum())
 
 
+def _beside_ignorance(problem: Problem[C], part: Terms) -> Tensor:
+    """(S + R,) `ensemble_losses` in units in which a model that finds all candidates alike has log 2.
+
+    So the best of eight is no more suspect than the better of two, before anything is known.
+    """
+    blank = ensemble_losses(problem, part, torch.zeros(problem.reward.members, len(problem.candidates)))
+    return ensemble_losses(problem, part) * (math.log(2) / blank.clamp(min=1e-3))
+
+
 def _is_pair(part: Terms, terms: Tensor) -> Tensor:
-    """(J,) whether a judgement is a single comparison of two."""
+    """(J,) whether a judgement is a single comparison of two that prefers one."""
     two = torch.zeros(len(terms), dtype=torch.bool)
-    two[part.choices.judgement[part.choices.present.sum(1) == 2]] = True
+    two[part.choices.judgement[(part.choices.present.sum(1) == 2) & ~part.choices.tied]] = True
     return two & (terms == 1)

@@ -27,8 +27,9 @@ class Likelihood:
     """
 
     def __init__(self, members: int, terms: Terms, ties: Ties, error_rate: float, reliability: Reliability) -> None:
-        self._ties, self._error_rate, self._labelers = ties, error_rate, terms.labelers
-        self.tie = torch.zeros(members, requires_grad=bool(ties != "half" and terms.choices.tied.any()))
+        self._ties: Ties = ties if terms.choices.tied.any() else "half"  # without ties, the limit that none are called
+        self._error_rate, self._labelers = error_rate, terms.labelers
+        self.tie = torch.zeros(members, requires_grad=self._ties != "half")
         self.first_threshold = torch.full((members, 1), -1.0, requires_grad=terms.scale > 0)
         self.gaps = torch.zeros(members, max(terms.scale - 2, 0), requires_grad=terms.scale > 2)
         start = math.log(START / (1 - START))

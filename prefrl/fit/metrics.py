@@ -42,18 +42,19 @@ def calibration_error(predicted: Floats, preference: Floats, bins: int = 10) -> 
     return float(sum(gaps))
 
 
-def temperature(logits: Floats, preference: Floats, error: Floats | float = 0.0) -> float:
+def temperature(logits: Floats, preference: Floats, error: Floats | float = 0.0, weight: Floats | float = 1.0) -> float:
     """What to divide logits (E, M) by, so that the members' mean probability fits preferences (M,) best.
 
     Guo et al. 2017, section 4.2, with a normal prior on log T about 0: a few comparisons cannot say much. 1 for none.
-    `error`: the probability (M,) that an answer is turned round, see `judged_probability`.
+    `error`: the probability (M,) that an answer is turned round, see `judged_probability`; `weight`: how much each
+    comparison counts, which matters beside the prior.
     """
 
     def loss(log_t: float) -> float:
         p = judged_probability(expit(logits / math.exp(log_t)).mean(0), error)
         p = np.clip(p, 1e-12, 1 - 1e-12)
         likelihood = preference * np.log(p) + (1 - preference) * np.log(1 - p)
-        return float((log_t / CERTAINTY) ** 2 / 2 - likelihood.sum())
+        return float((log_t / CERTAINTY) ** 2 / 2 - (weight * likelihood).sum())
 
     if not len(preference):
         return 1.0

@@ -40,7 +40,7 @@ class Discriminator:
     """Running maximum of a trusted judgement's loss. A model that knows nothing has log 2, and trusts all pairs."""
 
     def judge(self, loss: Tensor, pairs: Tensor) -> tuple[Verdict, Discriminator]:
-        """Losses (J,) of judgements, -log of the ensemble's probability of each -> who is trusted, and what comes next.
+        """Losses (J,) of judgements, log 2 where nothing is known -> who is trusted, and what comes next.
 
         A judgement is trusted below -log(x) + x / 2 + beta s, where x is the `ceiling` and s the losses' standard
         deviation. One of a pair (`pairs` (J,) bool) that is less probable than 1 in 1000 is turned round.

@@ -47,13 +47,15 @@ def pseudo_loss(scores: Tensor, edges: Tensor, confidence: float) -> Tensor:
 def crop(stacked: Mapping[str, Tensor], share: float, order: torch.Generator) -> Mapping[str, Tensor]:
     """Cut windows of one random length, each at a random place, out of all segments (section 4.2).
 
-    `share` is the most that is cut away. Raises `ConfigError` for a reward model that does not stack steps.
+    `share` is the most that is cut away; of a segment that is shorter than the window, nothing is. Raises
+    `ConfigError` for a reward model that does not stack steps.
     """
     if "inputs" not in stacked:
         raise ConfigError("fitting.crop: only segments can be cropped; set it to 0 for text")
     count, steps = stacked["inputs"].shape[:2]
     shortest = max(1, round(steps * (1 - share)))
     length = int(torch.randint(shortest, steps + 1, (), generator=order))
-    begin = torch.randint(0, steps - length + 1, (count, 1), generator=order)
+    places = (stacked["mask"].sum(1) - length).clamp(min=0).long() + 1
+    begin = (torch.rand(count, generator=order) * places).long()[:, None]
     rows, columns = torch.arange(count)[:, None], begin + torch.arange(length)
     return {name: x[rows, columns] for name, x in stacked.items()}

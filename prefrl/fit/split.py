@@ -18,11 +18,13 @@ def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:
 
     The choice hangs on the id of a component's oldest query alone: it stays the same when judgements are added, so
     what was held out once is not trained on later, unless a new judgement joins two components of which the older one
-    is trained on. Nothing is held out where that would leave nothing to train on.
+    is trained on, or makes one that holds more than half of all: such a component is always trained on. Nothing is
+    held out where that would leave nothing to train on.
     """
     component = _components(judged)
-    _, first = np.unique(component, return_index=True)
-    chosen = [component[i] for i in first if int(judged[i].query.id[:8], 16) < share * 2**32]
+    _, first, sizes = np.unique(component, return_index=True, return_counts=True)
+    small = first[2 * sizes <= len(judged)]
+    chosen = [component[i] for i in small if int(judged[i].query.id[:8], 16) < share * 2**32]
     held_out = np.isin(component, chosen)
     rest = [one for one, out in zip(judged, held_out, strict=True) if not out]
     return held_out if prefers(rest) else np.zeros(len(judged), bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
@@ -15,6 +16,8 @@ from prefrl.graph import implied_pairs
 from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating
 
 Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
+MOST_TIED = 10
+"""Sets of so many candidates are a thousand terms."""
 Rankings: TypeAlias = Literal["plackett_luce", "pairs"]
 
 
@@ -124,10 +127,18 @@ def terms(judged: Sequence[Judged[C]], ids: Sequence[str], ties: Ties, rankings:
     scales = sorted({one.judgement.scale for one in judged if isinstance(one.judgement, Rating)})
     if len(scales) > 1:
         raise ValueError(f"ratings of one fit must share a scale, got scales of {scales} levels: fit them apart")
-    if ties == "rao_kupper" and rankings != "pairs" and any(len(one.query.candidates) > 2 for one in judged):
+    wide = (Choice,) if rankings == "pairs" else (Choice, Ranking)
+    if ties == "rao_kupper" and any(isinstance(j.judgement, wide) and len(j.query.candidates) > 2 for j in judged):
         raise ValueError(
-            "ties=rao_kupper knows pairs only, and there are rankings: set rankings=pairs, or ties=davidson"
+            "ties=rao_kupper knows pairs only, and there are rankings or choices of more than two: set ties=davidson, "
+            "or for rankings rankings=pairs"
         )
+    if rankings != "pairs" and any(_tied_group(one.judgement) > MOST_TIED for one in judged):
+        raise ValueError(
+            f"a ranking ties more than {MOST_TIED} candidates, and has too many orders: set rankings=pairs"
+        )
+    if ties == "davidson" and any(len(one.query.candidates) > MOST_TIED for one in judged):
+        raise ValueError(f"ties=davidson weighs all sets of candidates, of at most {MOST_TIED}: set ties=half")
     names = tuple(dict.fromkeys(one.judgement.labeler for one in judged))
     numbers = {name: i for i, name in enumerate(names)}
     return Terms(
@@ -137,6 +148,11 @@ def terms(judged: Sequence[Judged[C]], ids: Sequence[str], ties: Ties, rankings:
         labelers=names,
         scale=scales[0] if scales else 0,
     )
+
+
+def _tied_group(judgement: Judgement) -> int:
+    """The largest number of candidates that share a rank."""
+    return max(Counter(judgement.ranks).values()) if isinstance(judgement, Ranking) else 1
 
 
 def stages(judgement: Judgement, size: int, ties: Ties, rankings: Rankings) -> list[Stage]:

@@ -102,7 +102,7 @@ def _finish(problem: Problem[C], data: Batch[C], out: np.ndarray, scores: Tensor
     """Measure a fit, and calibrate the model."""
     test, errors = data.subset(out), problem.likelihood.pair_errors(problem.every)
     logits = preference_logits(scores, test.edges).double().numpy()
-    heat = temperature(logits, test.preference, errors[test.group])
+    heat = temperature(logits, test.preference, errors[test.group], test.weight)
     problem.reward.calibrate(heat)
     metrics = {
         "judgements": float(len(problem.every.labeler)),

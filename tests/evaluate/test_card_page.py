@@ -59,6 +59,9 @@ def test_one_reason_for_many_numbers_is_given_once() -> None:
     assert [(row.name, row.note) for row in told["Length"]] == [
         ("nothing to measure", "not defined: all candidates have length 2")
     ]
+    assert [row.name for row in told["Gold"]] == ["nothing to measure"]
+    reasons = told["Gold"][0].note.removeprefix("not defined: ").split("; ")
+    assert len(reasons) == len(set(reasons)) > 1
     assert "Members" not in told
 
 

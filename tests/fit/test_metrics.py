@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from prefrl.fit.metrics import accuracy, brier, calibration_error
+from prefrl.fit.metrics import accuracy, brier, calibration_error, judged_probability, temperature
 
 
 def test_accuracy_leaves_ties_out_and_gives_half_for_an_even_prediction() -> None:
@@ -33,3 +33,25 @@ def test_a_calibrated_prediction_has_no_calibration_error(rng: np.random.Generat
 def test_calibration_does_not_depend_on_which_candidate_comes_first(rng: np.random.Generator) -> None:
     predicted, preference = rng.uniform(size=100), rng.integers(0, 2, 100).astype(float)
     assert calibration_error(predicted, preference) == pytest.approx(calibration_error(1 - predicted, 1 - preference))
+
+
+def test_a_temperature_finds_by_how_much_logits_are_too_large(rng: np.random.Generator) -> None:
+    true = rng.normal(size=(1, 5000))
+    preference = (rng.uniform(size=5000) < 1 / (1 + np.exp(-true[0]))).astype(float)
+    assert temperature(3 * true, preference) == pytest.approx(3, rel=0.1)
+    error = np.full(5000, 0.2)
+    turned = np.where(rng.uniform(size=5000) < error, 1 - preference, preference)
+    assert temperature(3 * true, turned, error) == pytest.approx(3, rel=0.2)
+
+
+def test_few_comparisons_move_a_temperature_little() -> None:
+    assert temperature(np.zeros((2, 0)), np.zeros(0)) == 1.0
+    wrong = np.array([[4.0, 4.0]])
+    many, few, light = (
+        temperature(np.tile(wrong, n), np.zeros(2 * n), 0.0, w) for n, w in ((50, 1.0), (1, 1.0), (1, 0.1))
+    )
+    assert 1.0 < light < few < many
+
+
+def test_the_probability_of_an_answer_is_mixed_with_mistakes() -> None:
+    assert judged_probability(np.array([0.9]), 0.1)[0] == pytest.approx(0.9 * 0.9 + 0.1 * 0.1)

@@ -38,12 +38,21 @@ def test_a_crop_is_a_window_of_each_row_of_one_length() -> None:
     order = torch.Generator().manual_seed(0)
     lengths = set()
     for _ in range(40):
-        found = crop({"inputs": steps[..., None].clone(), "mask": steps}, 0.3, order)
+        found = crop({"inputs": steps[..., None].clone(), "mask": torch.ones(6, 20), "again": steps}, 0.3, order)
         inputs = found["inputs"][..., 0]
         lengths.add(inputs.shape[1])
         assert (inputs.diff(dim=1) == 1).all()
-        torch.testing.assert_close(inputs, found["mask"])
+        torch.testing.assert_close(inputs, found["again"])
     assert lengths == set(range(14, 21))
+
+
+def test_a_crop_shows_no_padding_where_there_are_steps_enough() -> None:
+    mask = (torch.arange(20) < torch.tensor([[20], [12], [3]])).float()
+    order = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        found = crop({"inputs": mask[..., None], "mask": mask}, 0.9, order)["mask"]
+        size = torch.full((3,), float(found.shape[1]))
+        torch.testing.assert_close(found.sum(1), size.minimum(torch.tensor([20.0, 12.0, 3.0])))
 
 
 def test_texts_are_not_cropped() -> None:

@@ -43,6 +43,14 @@ def test_a_split_that_would_leave_nothing_to_train_on_holds_out_nothing(judged: 
     assert not split(one, 0.5).any()
 
 
+def test_a_component_of_more_than_half_of_all_is_trained_on(
+    judged: list[Judged[Segment]], make_segment: Callable[..., Segment]
+) -> None:
+    hub = [make_segment() for _ in range(40)]
+    star = [compare(Query((hub[0], other))) for other in hub[1:]]
+    assert split(star + judged[:10], 0.999).tolist() == [False] * 39 + [True] * 10
+
+
 def test_all_judgements_of_one_query_are_on_one_side(make_query: Callable[..., Query[Segment]]) -> None:
     queries = [make_query(0.0) for _ in range(40)] * 2
     some = [Judged(q, Rating(q.id, (i % 3,), 3, str(i))) for i, q in enumerate(queries)]

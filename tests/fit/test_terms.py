@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 
 import choix
@@ -85,8 +84,10 @@ def test_rankings_with_ties_as_outcomes_have_probabilities_that_sum_to_one(rng: 
     pool, scores = candidates(4), rng.normal(size=4)
     some = [judged(pool, lambda id, r=ranks: Ranking(id, r)) for ranks in weak_orders(4)]  # type: ignore[misc]
     assert len(some) == 75
-    each = [loss([one], pool, scores, ties="davidson") for one in some]
-    assert sum(math.exp(-x) for x in each) == pytest.approx(1, rel=1e-5)
+    made = terms(some, [c.id for c in pool], "davidson", "plackett_luce")
+    losses = Likelihood(1, made, "davidson", 0.0, "alike").losses(made, torch.tensor(scores).float()[None])
+    each = per_judgement(made, losses.detach())[0][0]
+    assert float((-each).exp().sum()) == pytest.approx(1, rel=1e-5)
 
 
 def test_a_judgements_weight_multiplies_its_likelihood() -> None:
@@ -120,6 +121,11 @@ def test_rao_and_kupper_knows_no_rankings_of_three() -> None:
     with pytest.raises(ValueError, match="rankings=pairs"):
         terms(some, [c.id for c in pool], "rao_kupper", "plackett_luce")
     assert terms(some, [c.id for c in pool], "rao_kupper", "pairs").choices.pairs
+    best = [judged(pool, lambda id: Choice(id, 0))]
+    with pytest.raises(ValueError, match="choices of more than two"):
+        terms(best, [c.id for c in pool], "rao_kupper", "pairs")
+    rated = [judged(pool, lambda id: Rating(id, (0, 1, 1), 2))]
+    assert terms(rated, [c.id for c in pool], "rao_kupper", "plackett_luce").scale == 2
 
 
 @pytest.fixture
@@ -152,3 +158,14 @@ def test_a_subset_counts_its_judgements_anew(mixed: Terms) -> None:
 def test_the_losses_of_a_judgement_are_gathered(mixed: Terms) -> None:
     sums, counts = per_judgement(mixed, torch.ones(1, len(mixed.choices.weight) + 3))
     assert sums[0].tolist() == counts.tolist() == [2, 1, 3, 2]
+
+
+def test_more_tied_candidates_than_can_be_weighed_are_refused() -> None:
+    pool = candidates(11)
+    ids = [c.id for c in pool]
+    tied = [judged(pool, lambda id: Ranking(id, (0,) * 11))]
+    for ties in ("half", "davidson"):
+        with pytest.raises(ValueError, match=r"(more than|at most) 10"):
+            terms(tied, ids, ties, "plackett_luce")
+    assert len(terms(tied, ids, "half", "pairs").choices.items) == 55
+    assert len(terms([ranked(pool, range(11))], ids, "half", "plackett_luce").choices.items) == 10

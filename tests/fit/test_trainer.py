@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import pearsonr
 
-from prefrl.components import settings_class
+from prefrl.components import ConfigError, settings_class
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
 from prefrl.graph import batch
@@ -165,7 +165,8 @@ def test_a_confident_prediction_that_is_right_has_a_finite_loss(judged: list[Jud
             """Nothing to calibrate."""
 
     reward: Any = Sure()
-    fitted = fit_judged(reward, judged, FittingSettings(epochs=1), np.random.default_rng(0))
+    settings = FittingSettings(epochs=1, weight_decay="adaptive")
+    fitted = fit_judged(reward, judged, settings, np.random.default_rng(0))
     assert fitted.metrics["loss"] == fitted.metrics["loss_held_out"] == pytest.approx(0, abs=1e-6)
 
 
@@ -308,9 +309,69 @@ def test_pairs_nobody_judged_add_to_a_few_that_were(
     assert recovered(pseudo_labels=1.0, confidence=0.9, crop=0.2) > recovered() - 0.02
 
 
-def test_a_model_that_is_solved_for_needs_no_epochs(judged: list[Judged[Segment]]) -> None:
+def linear() -> Any:
     settings: Any = settings_class("rewards", "linear")
-    reward = settings(members=4).build(Task(), np.random.default_rng(0))
-    fitted = fit_judged(reward, judged, FittingSettings(ties="davidson"), np.random.default_rng(0))
+    return settings(members=4).build(Task(), np.random.default_rng(0))
+
+
+def test_a_model_that_is_solved_for_needs_no_epochs(judged: list[Judged[Segment]]) -> None:
+    some = [Judged(j.query, Comparison(j.query.id, 0.5)) if i % 10 == 0 else j for i, j in enumerate(judged)]
+    fitted = fit_judged(linear(), some, FittingSettings(ties="davidson"), np.random.default_rng(0))
     assert fitted.metrics["epochs"] == 0
+    assert 0.0 < fitted.metrics["tie"] < 0.8
     assert fitted.metrics["accuracy_held_out"] > 0.9
+
+
+@pytest.mark.parametrize("given", [{"denoise": "flip"}, {"pseudo_labels": 1.0}, {"crop": 0.2}])
+def test_what_needs_epochs_is_refused_where_a_model_is_solved_for(
+    judged: list[Judged[Segment]], given: dict[str, Any]
+) -> None:
+    with pytest.raises(ConfigError, match=f"fitting.{next(iter(given))}: this reward is solved for"):
+        fit_judged(linear(), judged, FittingSettings(**given), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("ties", ["davidson", "rao_kupper"])
+def test_where_nobody_called_a_tie_every_model_of_ties_is_bradley_and_terrys(
+    judged: list[Judged[Segment]], ties: Any
+) -> None:
+    plain, with_ties = (
+        fit_judged(model(), judged, FittingSettings(epochs=2, ties=t), np.random.default_rng(0)).metrics
+        for t in ("half", ties)
+    )
+    assert with_ties == plain
+
+
+def test_what_patience_goes_back_to_is_better_on_held_out_judgements_than_the_end(
+    judged: list[Judged[Segment]],
+) -> None:
+    rng = np.random.default_rng(0)
+    noisy = [Judged(j.query, Comparison(j.query.id, float(rng.random() < 0.5))) for j in judged[:150]]
+
+    def held_out_loss(patience: int) -> float:
+        settings = FittingSettings(epochs=60, learning_rate=3e-3, held_out=0.3, patience=patience)
+        return fit_judged(model(1), noisy, settings, np.random.default_rng(0)).metrics["loss_held_out"]
+
+    assert held_out_loss(60) < held_out_loss(0) - 0.01
+
+
+def test_the_model_is_calibrated_by_the_temperature_that_is_reported(judged: list[Judged[Segment]]) -> None:
+    reward = model()
+    fitted = fit_judged(reward, judged, FittingSettings(epochs=5), np.random.default_rng(0))
+    assert reward.state()["temperature"] == fitted.metrics["temperature"] != 1.0
+
+
+def test_training_metrics_are_of_training_judgements_alone(judged: list[Judged[Segment]]) -> None:
+    metrics = fit_judged(
+        model(1), judged[:40], FittingSettings(epochs=300, held_out=0.3), np.random.default_rng(0)
+    ).metrics
+    assert metrics["accuracy"] == 1.0
+    assert metrics["accuracy_held_out"] < 1.0
+
+
+def test_flipping_what_can_never_be_improbable_is_refused(judged: list[Judged[Segment]]) -> None:
+    for settings in (
+        FittingSettings(denoise="flip", error_rate=0.1),
+        FittingSettings(denoise="flip", reliability="learned"),
+    ):
+        with pytest.raises(ConfigError, match="denoise=flip"):
+            fit_judged(model(1), judged[:40], settings, np.random.default_rng(0))
