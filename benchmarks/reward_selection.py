@@ -1,4 +1,4 @@
-"""How many labels does asking well save? Accuracy against labels for every selector, on two control tasks and on text.
+"""How many labels does asking well save? Accuracy against labels for every selector, on control tasks and on text.
 
     python benchmarks/reward_selection.py [--short] [--seeds 5] [--out docs/curves/reward_selection.csv]
 
@@ -59,6 +59,7 @@ class Case:
 
 CASES = (
     Case("control/pendulum", (), 200, 20),
+    Case("control/cartpole", (), 200, 20),
     Case("control/hopper", ("loop.rounds=5", "loop.labels=300"), 300, 30),
     Case("text/reviews", HEADS, 150, 15, pool=1200, tested=1000),
 )
