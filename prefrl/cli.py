@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from prefrl import cli_store
+
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
     from prefrl.config import Config
 
@@ -21,6 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+app.add_typer(cli_store.commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
 Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]

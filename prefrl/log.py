@@ -1,47 +1,40 @@
-"""An append-only log of events in a database: SQLite by default, any SQLAlchemy URL otherwise."""
+"""An append-only, chained log of events in a database: SQLite by default, any SQLAlchemy URL otherwise."""
 
 from __future__ import annotations
 
-import json
-import os
-import socket
-import sqlite3
-from collections.abc import Iterable
+import errno
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sql
-from filelock import FileLock, Timeout
-from sqlalchemy.exc import DatabaseError
+from sqlalchemy import Connection
+from sqlalchemy.exc import DatabaseError, IntegrityError, OperationalError
 
+from prefrl import engines
+from prefrl.engines import StoreError
 from prefrl.files import write_file
+from prefrl.projection import CHUNK, all_events, chunks, project
+from prefrl.tables import SCHEMA, chained, event, meta, metadata, version
 
-SCHEMA = 1
-metadata = sql.MetaData()
-event = sql.Table(
-    "event",
-    metadata,
-    sql.Column("seq", sql.Integer, primary_key=True),
-    sql.Column("id", sql.Text, unique=True, nullable=False),
-    sql.Column("kind", sql.Text, nullable=False),
-    sql.Column("subject", sql.Text, nullable=False),
-    sql.Column("actor", sql.Text, nullable=False),
-    sql.Column("body", sql.JSON, nullable=False),
-    sql.Column("at", sql.Text, nullable=False),
-    sqlite_autoincrement=True,
-)
-meta = sql.Table(
-    "meta", metadata, sql.Column("key", sql.Text, primary_key=True), sql.Column("value", sql.Text, nullable=False)
-)
-for change in ("UPDATE", "DELETE"):
-    trigger = f"CREATE TRIGGER event_no_{change.lower()} BEFORE {change} ON event "
-    refusal = sql.DDL(trigger + "BEGIN SELECT RAISE(ABORT, 'the event log is append-only'); END")  # type: ignore[no-untyped-call]
-    sql.event.listen(event, "after_create", refusal.execute_if(dialect="sqlite"))
+BALLAST = 8 * 2**20
+"""Bytes kept in reserve while people label: a full disk still has room to close the books."""
 
 
-class StoreError(ValueError):
-    """A store cannot be opened, or does not hold what was asked for."""
+_KNOWN = sql.select(event.c.id, event.c.seq).where(event.c.id == sql.bindparam("b_id"))
+_INSERT = sql.insert(event)
+
+
+class StoreFull(StoreError):
+    """Nothing more fits on the disk. What was acknowledged is safe."""
+
+
+class DamagedStore(StoreError):
+    """The log is not what was written."""
 
 
 def row(id: str, kind: str, subject: str = "", actor: str = "", body: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -50,106 +43,248 @@ def row(id: str, kind: str, subject: str = "", actor: str = "", body: dict[str, 
     return {"id": id, "kind": kind, "subject": subject, "actor": actor, "body": body or {}, "at": now}
 
 
+@dataclass
+class Transaction:
+    """Events that are about to be appended together, over one connection."""
+
+    connection: Connection
+    seq: int
+    hash: str
+
+    def append(self, one: dict[str, Any]) -> int:
+        """Append an event; returns its number. One whose id is there already changes nothing."""
+        return self.extend([one])[0]
+
+    def extend(self, rows: Iterable[dict[str, Any]]) -> list[int]:
+        """Append events; returns the number of each. Those whose ids are there already change nothing."""
+        rows = list(rows)
+        numbers = self._numbers([one["id"] for one in rows])
+        fresh = []
+        for one in rows:
+            if one["id"] not in numbers:
+                self.seq += 1
+                numbers[one["id"]] = self.seq
+                self.hash = chained(self.hash, one | {"seq": self.seq})
+                fresh.append(one | {"seq": self.seq, "hash": self.hash})
+        if fresh:
+            self.connection.execute(_INSERT, fresh)
+            project(self.connection, fresh)
+        return [numbers[one["id"]] for one in rows]
+
+    @contextmanager
+    def savepoint(self) -> Iterator[None]:
+        """What raises inside is undone alone."""
+        seq, hash = self.seq, self.hash
+        try:
+            with self.connection.begin_nested():
+                yield
+        except BaseException:
+            self.seq, self.hash = seq, hash
+            raise
+
+    def _numbers(self, ids: Sequence[str]) -> dict[str, int]:
+        """The numbers of the events that are there already."""
+        found: dict[str, int] = {}
+        for some in chunks(ids, CHUNK):
+            if len(some) == 1:
+                rows = self.connection.execute(_KNOWN, {"b_id": some[0]})
+            else:
+                rows = self.connection.execute(sql.select(event.c.id, event.c.seq).where(event.c.id.in_(some)))
+            found |= {one.id: one.seq for one in rows}
+        return found
+
+
 class EventLog:
-    """The log of one folder. One process may append, any number may read."""
+    """The log of one folder. One process may append, from any of its threads; any number may read."""
 
     def __init__(self, folder: Path, write: bool, url: str | None = None) -> None:
         """Open the log; make it where it is missing and `write` is true.
 
-        Raises `StoreError` where another process writes, where there is none to read, where the file is damaged, or
-        where a newer prefrl made it.
+        Without `url`, a file `store.url` in the folder may name another SQLAlchemy database. Raises `StoreError` where
+        another process writes, where there is none to read, where the file is damaged, or where a newer prefrl made it.
         """
+        url = url or engines.saved_url(folder)
         if not write and url is None and not (folder / "store.db").exists():
             raise StoreError(f"{folder} holds no store: expected the file {folder / 'store.db'}")
         self.folder = folder
-        self._owner = _own(folder) if write else None
-        self._engine = _engine(folder, write, url)
+        self.full = False
+        """Whether the disk was full when it was last written to."""
+        self._turn = threading.RLock()
+        self._head = (0, "")
+        self._owner = engines.own(folder) if write else None
         try:
-            self._prepare(write)
+            self._writer = engines.writer(folder, url) if write else None
+            self._reader = engines.reader(folder, url)
+            self._prepare()
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
         """Let go of the database, and of the right to write."""
-        self._engine.dispose()
+        for engine in (getattr(self, "_reader", None), getattr(self, "_writer", None)):
+            if engine is not None:
+                engine.dispose()
         if self._owner is not None:
-            (self.folder / "owner.json").unlink(missing_ok=True)
-            self._owner.release()
+            engines.disown(self.folder, self._owner)
+            self._owner = None
+
+    # --- writing ---------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def transaction(self) -> Iterator[Transaction]:
+        """Append events together: all are on disk when this ends, or none. One thread at a time.
+
+        Raises `StoreFull` when the disk is; later ones are tried again once there is room for the reserve.
+        """
+        with self._turn:
+            if self._writer is None or self._owner is None:
+                raise StoreError(f"the store in {self.folder} was opened for reading only")
+            if self.full:
+                self._recover()
+            try:
+                with self._writer.begin() as connection:
+                    at = Transaction(connection, *self._head)
+                    yield at
+                    if at.seq > self._head[0]:
+                        _set_head(connection, at.seq, at.hash)
+                self._head = at.seq, at.hash
+            except OperationalError as error:
+                if not _says_full(error):
+                    raise
+                self._is_full()
+                raise StoreFull(
+                    f"the disk with {self.folder} is full: nothing more can be stored until there is room; what was "
+                    "acknowledged is safe"
+                ) from error
 
     def append(self, rows: Iterable[dict[str, Any]]) -> None:
         """Add the events whose id is new, in one transaction that is on disk when this returns."""
-        if self._owner is None:
-            raise StoreError(f"the store in {self.folder} was opened for reading only")
-        fresh: dict[str, dict[str, Any]] = {}
-        for one in rows:
-            fresh.setdefault(one["id"], one)
-        with self._engine.begin() as connection:
-            ids = list(fresh)
-            for i in range(0, len(ids), 500):  # databases limit the number of parameters of a statement
-                for known in connection.scalars(sql.select(event.c.id).where(event.c.id.in_(ids[i : i + 500]))):
-                    del fresh[known]
-            if fresh:
-                connection.execute(sql.insert(event), list(fresh.values()))
+        with self.transaction() as at:
+            at.extend(rows)
 
-    def since(self, seq: int) -> list[sql.Row[Any]]:
-        """The events after a sequence number, oldest first."""
-        with self._engine.connect() as connection:
-            return list(connection.execute(sql.select(event).where(event.c.seq > seq).order_by(event.c.seq)))
+    def reserve(self) -> None:
+        """Keep some of the disk in reserve, for when it is full; for stores that people answer into."""
+        path = self.folder / "ballast"
+        if not path.exists():
+            write_file(path, bytes(BALLAST))
 
-    def _prepare(self, write: bool) -> None:
+    def _is_full(self) -> None:
+        self.full = True
+        (self.folder / "ballast").unlink(missing_ok=True)
+
+    def _recover(self) -> None:
+        """Be writable again if there is room. Raises `StoreFull` if not."""
         try:
-            if write:
-                metadata.create_all(self._engine)
-            with self._engine.begin() as connection:
-                found = connection.scalar(sql.select(meta.c.value).where(meta.c.key == "schema"))
-                if found is None and write:
-                    connection.execute(sql.insert(meta), {"key": "schema", "value": str(SCHEMA)})
+            self.reserve()
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise StoreFull(
+                f"the disk with {self.folder} is still full: make room, and answers are taken again"
+            ) from None
+        self.full = False
+
+    # --- reading ---------------------------------------------------------------------------------------------
+
+    @property
+    def sequence(self) -> int:
+        """The number of the newest event."""
+        with self.reading() as connection:
+            return connection.scalar(sql.select(sql.func.max(event.c.seq))) or 0
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection that cannot write, for one consistent look."""
+        with self._reader.connect() as connection:
+            yield connection
+
+    def since(self, seq: int) -> Iterator[dict[str, Any]]:
+        """The events after a number, oldest first, with their numbers and hashes."""
+        with self.reading() as connection:
+            yield from all_events(connection, seq)
+
+    # --- opening ---------------------------------------------------------------------------------------------
+
+    def _prepare(self) -> None:
+        try:
+            if self._writer is not None:
+                self._make_or_migrate(self._writer)
+            with self.reading() as connection:
+                check_schema(connection, self.folder)
+                self._head = head(connection, self.folder)
         except DatabaseError as error:
             raise StoreError(f"the store in {self.folder} cannot be opened: {error.orig}") from error
-        if found is not None and int(found) > SCHEMA:
-            raise StoreError(
-                f"the store in {self.folder} has schema {found}, made by a newer prefrl; this one knows up to "
-                f"{SCHEMA}: upgrade with pip install -U prefrl"
-            )
+
+    def _make_or_migrate(self, writer: sql.Engine) -> None:
+        with writer.begin() as connection:
+            there = sql.inspect(connection).has_table("event")
+            if not there:
+                metadata.create_all(connection)
+                connection.execute(sql.insert(version), {"version_num": str(SCHEMA)})
+                connection.execute(sql.insert(meta), {"key": "schema", "value": str(SCHEMA)})
+        if there and schema_of(self._reader) < SCHEMA:
+            from prefrl.migrate import migrate
+
+            migrate(writer, self.folder)
 
 
-def _own(folder: Path) -> FileLock:
-    """Become the one process that may write, or say who is."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock, note = FileLock(folder / "owner.lock", timeout=0), folder / "owner.json"
-    try:
-        lock.acquire()
-    except Timeout:
-        holder = note.read_text() if note.exists() else "unknown"
+def head(connection: Connection, folder: Path) -> tuple[int, str]:
+    """Number and hash of the newest event. Raises `DamagedStore` where the log has lost its end."""
+    newest = connection.execute(sql.select(event.c.seq, event.c.hash).order_by(event.c.seq.desc()).limit(1)).first()
+    found = (newest.seq, newest.hash) if newest else (0, "")
+    noted = connection.scalar(sql.select(meta.c.value).where(meta.c.key == "head")) or "0:"
+    if noted != f"{found[0]}:{found[1]}":
+        raise DamagedStore(
+            f"the store in {folder} ends at event {found[0]}, but {noted.partition(':')[0]} was its last: it is "
+            "damaged; `prefrl verify` says where, and can save what is whole"
+        )
+    return found
+
+
+def check_schema(connection: Connection, folder: Path) -> None:
+    """Raise `StoreError` where the tables are not those of this version."""
+    found = _schema(connection)
+    if found > SCHEMA:
         raise StoreError(
-            f"another process is writing to the store in {folder}: {holder}; "
-            "wait for it, stop it, or use another folder"
-        ) from None
-    write_file(note, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
-    return lock
+            f"the store in {folder} has schema {found}, made by a newer prefrl; this one knows up to "
+            f"{SCHEMA}: upgrade with pip install -U prefrl"
+        )
+    if found < SCHEMA:
+        raise StoreError(
+            f"the store in {folder} has schema {found}, made by an older prefrl: `prefrl migrate {folder}` brings it "
+            f"to {SCHEMA}, and keeps a copy"
+        )
 
 
-def _engine(folder: Path, write: bool, url: str | None) -> sql.Engine:
-    if url is not None:
-        return sql.create_engine(url)
-    path = (folder / "store.db").absolute()
-    uri = f"{path.as_uri()}?mode={'rwc' if write else 'ro'}"  # a reader must not make a store where there is none
-    engine = sql.create_engine("sqlite://", creator=lambda: sqlite3.connect(uri, uri=True), poolclass=sql.QueuePool)
-    sql.event.listen(engine, "connect", _on_connect if write else _on_connect_reader)
-    sql.event.listen(
-        engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
-    )
-    return engine
+def schema_of(engine: sql.Engine) -> int:
+    with engine.connect() as connection:
+        return _schema(connection)
 
 
-def _on_connect(connection: Any, _: object) -> None:
-    """Every acknowledged label is on disk: WAL with full synchronisation; sqlite3 must not begin on its own."""
-    connection.isolation_level = None
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=30000"):
-        connection.execute(f"PRAGMA {pragma}")
+def _schema(connection: Connection) -> int:
+    found = connection.scalar(sql.select(meta.c.value).where(meta.c.key == "schema"))
+    return int(found) if found is not None else 0
 
 
-def _on_connect_reader(connection: Any, _: object) -> None:
-    connection.isolation_level = None
-    connection.execute("PRAGMA busy_timeout=30000")
+def _set_head(connection: Connection, seq: int, hash: str) -> None:
+    value = f"{seq}:{hash}"
+    if not connection.execute(sql.update(meta).where(meta.c.key == "head").values(value=value)).rowcount:
+        connection.execute(sql.insert(meta), {"key": "head", "value": value})
+
+
+def _says_full(error: OperationalError) -> bool:
+    text = str(error.orig).lower()
+    return "disk is full" in text or "no space left" in text or "could not extend" in text
+
+
+__all__ = [
+    "DamagedStore",
+    "EventLog",
+    "IntegrityError",
+    "StoreError",
+    "StoreFull",
+    "Transaction",
+    "head",
+    "row",
+]

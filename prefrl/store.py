@@ -1,81 +1,31 @@
 """Every behaviour asked about and every answer given: an append-only log of events, beside files named by content.
 
-The log is the truth. Open queries, judgements and counts are read off it, so nothing can disagree with it. The
+The log is the truth; the tables beside it are derived from it in the same transaction, and can be written again. The
 arrays of segments lie in `blobs/`, the hidden gold in `gold/`, which nothing but an oracle or an evaluation opens.
-One process writes at a time; any number may read while it does.
+One process writes at a time, from any of its threads; any number may read while it does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic
 
-from sqlalchemy import Row
+import sqlalchemy as sql
 
 from prefrl.blobs import read_arrays, write_arrays
-from prefrl.log import EventLog, StoreError, row
-from prefrl.types import (
-    Answer,
-    C,
-    Candidate,
-    Choice,
-    Comparison,
-    Floats,
-    Judged,
-    Query,
-    Ranking,
-    Rating,
-    Response,
-    Segment,
-    Skip,
-    check_fits,
-)
+from prefrl.events import ANSWER_TYPES, check_event, describe, load_candidate, read_answer
+from prefrl.log import EventLog, StoreError, Transaction, row
+from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
+from prefrl.tables import event, standing
+from prefrl.tables import query as asked
+from prefrl.types import Answer, C, Candidate, Floats, Judged, Query, Segment, Skip, check_fits
 
 WRITERS = 16
 """Files written at once."""
-ANSWERS: dict[str, type[Answer]] = {
-    "comparison": Comparison,
-    "ranking": Ranking,
-    "choice": Choice,
-    "rating": Rating,
-    "skip": Skip,
-}
-
-
-@dataclass
-class _View:
-    """What the log says, read once and kept up with."""
-
-    sequence: int = 0
-    candidates: dict[str, dict[str, Any]] = field(default_factory=dict)
-    queries: dict[str, list[str]] = field(default_factory=dict)
-    answers: list[tuple[int, str, str, Answer | None]] = field(default_factory=list)
-    """(sequence number, query, labeler, answer), None for a retraction; oldest first."""
-
-    def read(self, row: Row[Any]) -> None:
-        self.sequence = row.seq
-        if row.kind == "candidate":
-            self.candidates[row.id] = row.body
-        elif row.kind == "query":
-            self.queries[row.id] = row.body["candidates"]
-        elif row.kind in (*ANSWERS, "retract"):
-            answer = _answer(row.kind, row.subject, row.actor, row.body) if row.kind in ANSWERS else None
-            self.answers.append((row.seq, row.subject, row.actor, answer))
-
-    def standing(self, upto: int | None = None) -> dict[tuple[str, str], Answer]:
-        """(query, labeler) -> the answer that stands, in the order in which they were given."""
-        found: dict[tuple[str, str], Answer] = {}
-        for seq, query, labeler, answer in self.answers:
-            if upto is not None and seq > upto:
-                break
-            if answer is None:
-                found.pop((query, labeler), None)
-            else:
-                found[query, labeler] = answer
-        return found
+_SIZE = sql.select(asked.c.id, asked.c.size).where(asked.c.id == sql.bindparam("b_id"))
 
 
 class Store(Generic[C]):
@@ -85,16 +35,17 @@ class Store(Generic[C]):
         """Open, or make, the store of a folder.
 
         Raises `StoreError` where another process is writing to it, where it is missing (for reading), damaged, or
-        from a newer prefrl. `url` names another SQLAlchemy database for the log.
+        from a newer prefrl. `url` names another SQLAlchemy database for the log; so does a file `store.url` in the
+        folder.
         """
         self.folder = folder
-        self._log = EventLog(folder, write, url)
-        self._view = _View()
+        self.log = EventLog(folder, write, url)
+        self._queries: dict[str, tuple[str, ...]] = {}
         self._loaded: dict[str, C] = {}
 
     def close(self) -> None:
         """Let go of the database, and of the right to write."""
-        self._log.close()
+        self.log.close()
 
     def __enter__(self) -> Store[C]:
         return self
@@ -104,62 +55,89 @@ class Store(Generic[C]):
 
     # --- writing ---------------------------------------------------------------------------------------------
 
-    def ask(self, queries: Sequence[Query[C]]) -> None:
-        """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
+    def ask(self, queries: Sequence[Query[C]], purpose: str = "label", expected: Sequence[int] = ()) -> None:
+        """Add queries with their candidates; what is there already is left alone. Gold is filed apart.
+
+        With the purpose "check" nothing is learned from them: they find out whether a person looks, and `expected`
+        says which candidate of each is clearly the best.
+        """
         candidates = {c.id: c for query in queries for c in query.candidates}
         self._check_kind(candidates.values())
         self._file(candidates.values())
-        rows = [row(id, "candidate", body=_describe(candidate)) for id, candidate in candidates.items()]
-        rows += [row(query.id, "query", body={"candidates": [c.id for c in query.candidates]}) for query in queries]
-        self._log.append(rows)
+        more: list[dict[str, Any]] = [{} for _ in queries]
+        if purpose != "label":
+            more = [{"purpose": purpose, "expected": best} for _, best in zip(queries, expected, strict=True)]
+        with self.log.transaction() as tx:
+            rows = [row(id, "candidate", body=describe(candidate)) for id, candidate in candidates.items()]
+            for query, extra in zip(queries, more, strict=True):
+                body = {"candidates": [c.id for c in query.candidates], "batch": tx.seq} | extra
+                rows.append(row(query.id, "query", body=body))
+            tx.extend(rows)
 
     def answer(self, answers: Sequence[Answer]) -> None:
         """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
-        view = self._refresh()
+        with self.log.transaction() as tx:
+            self.put_all(tx, answers)
+
+    def put_all(self, tx: Transaction, answers: Sequence[Answer], about: dict[str, Any] | None = None) -> list[int]:
+        """Add answers in a transaction; returns their numbers. `about` is kept with each: how it came about."""
+        sizes = _sizes(tx, {answer.query for answer in answers})
+        there = words(tx.connection, [(answer.query, answer.labeler) for answer in answers])
         rows = []
         for answer in answers:
-            if answer.query not in view.queries:
+            if answer.query not in sizes:
                 raise StoreError(f"an answer to query {answer.query[:12]}, which was never asked")
-            _check_size(answer, len(view.queries[answer.query]))
-            kind = next(k for k, cls in ANSWERS.items() if isinstance(answer, cls))
+            _check_size(answer, sizes[answer.query])
+            kind = next(k for k, cls in ANSWER_TYPES.items() if isinstance(answer, cls))
             body = {k: v for k, v in asdict(answer).items() if k not in ("query", "labeler")}
-            rows.append(row(self._answer_id(answer.query, answer.labeler), kind, answer.query, answer.labeler, body))
-        self._log.append(rows)
+            revision = there.get((answer.query, answer.labeler), {"revision": 0})["revision"]
+            id = f"{answer.query}:{answer.labeler}:{revision}"
+            rows.append(row(id, kind, answer.query, answer.labeler, body | ({"about": about} if about else {})))
+        return tx.extend(rows)
+
+    def put(self, tx: Transaction, answer: Answer, about: dict[str, Any]) -> int:
+        """Add one answer in a transaction; returns its number."""
+        return self.put_all(tx, [answer], about)[0]
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""
-        if (query, labeler) not in self._refresh().standing():
-            raise StoreError(f"{labeler!r} has no answer to query {query[:12]} to take back")
-        self._log.append([row(f"{self._answer_id(query, labeler)}:retract", "retract", query, labeler, {})])
+        with self.log.transaction() as tx:
+            self.take_back(tx, query, labeler)
 
-    def merge(self, events: Sequence[dict[str, Any]], blobs: Path) -> int:
+    def take_back(self, tx: Transaction, query: str, labeler: str, about: dict[str, Any] | None = None) -> int:
+        """Take a labeler's answer back in a transaction; returns the retraction's number."""
+        word = words(tx.connection, [(query, labeler)]).get((query, labeler))
+        if word is None or word["kind"] == "retracted":
+            raise StoreError(f"{labeler!r} has no answer to query {query[:12]} to take back")
+        id = f"{query}:{labeler}:{word['revision']}:retract"
+        return tx.append(row(id, "retract", query, labeler, {"about": about} if about else {}))
+
+    def merge(self, events: Iterable[dict[str, Any]], blobs: Path) -> int:
         """Add the events of another store, arrays from its `blobs` folder; returns how many answers they hold.
 
         All or none: each is checked before anything is written. Raises `ValueError` naming the first bad event.
         """
-        known, candidates = dict(self._refresh().queries), dict[str, Any]()
+        events, queries = list(events), _Asked(self)
+        candidates: dict[str, Any] = {}
         for number, one in enumerate(events, 1):
             try:
-                _check_event(one, known, candidates, blobs)
+                check_event(one, queries, candidates, blobs)
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise ValueError(f"event {number} cannot be merged: {error}") from error
         self._check_kind(candidates.values())
         self._file(candidates.values())
-        self._log.append(events)
+        self.log.append(events)
         return sum(one["kind"] in ANSWERS for one in events)
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
         """A store holds segments or responses, not both: a learner could make nothing of the others."""
-        there = next(iter(self._refresh().candidates.values()), None)
+        with self.log.reading() as connection:
+            there = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
         new = next(iter(candidates), None)
-        if there is not None and new is not None and there["type"] != _describe(new)["type"]:
+        if there is not None and new is not None and there["type"] != describe(new)["type"]:
             raise StoreError(
                 f"the store in {self.folder} holds {there['type']}s, and cannot hold {type(new).__name__}s"
             )
-
-    def _answer_id(self, query: str, labeler: str) -> str:
-        retracted = sum(a is None and (q, n) == (query, labeler) for _, q, n, a in self._view.answers)
-        return f"{query}:{labeler}:{retracted}"
 
     def _file(self, candidates: Iterable[Candidate]) -> None:
         """Write arrays and gold, each under its id; in threads, since each file waits for the disk."""
@@ -178,40 +156,80 @@ class Store(Generic[C]):
     @property
     def sequence(self) -> int:
         """The number of the newest event: the snapshot that a fit is made on."""
-        return self._refresh().sequence
+        return self.log.sequence
 
     def open_queries(self, labeler: str = "") -> list[Query[C]]:
         """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
-        view = self._refresh()
-        closed = {
-            query
-            for (query, who), answer in view.standing().items()
-            if not isinstance(answer, Skip) or answer.reason == "incomparable" or who == labeler
-        }
-        return [self.query(id) for id in view.queries if id not in closed]
+        mine = standing.alias()
+        skipped = (mine.c.query == asked.c.id) & (mine.c.labeler == labeler) & (mine.c.kind == "skip")
+        unanswered = (asked.c.purpose == "label") & (asked.c.judged == 0) & (asked.c.incomparable == 0)
+        some = sql.select(asked.c.id).where(unanswered, ~sql.exists().where(skipped)).order_by(asked.c.seq)
+        with self.log.reading() as connection:
+            ids = list(connection.scalars(some))
+        self._fetch(ids)
+        return [self.query(id) for id in ids]
 
     def judged(self, upto: int | None = None) -> list[Judged[C]]:
         """Queries with their judgements, in the order in which they were given, up to a sequence number."""
-        answers = self._refresh().standing(upto).values()
+        answers = list(self._standing(JUDGEMENTS, upto))
+        self._fetch({answer.query for answer in answers})
         return [Judged(self.query(a.query), a) for a in answers if not isinstance(a, Skip)]
 
     def answers(self) -> list[Answer]:
         """Every answer that stands, skips included, in the order in which they were given."""
-        return list(self._refresh().standing().values())
+        return list(self._standing(ANSWERS))
 
-    def events(self) -> list[dict[str, Any]]:
+    def _standing(self, kinds: Sequence[str], upto: int | None = None) -> Iterator[Answer]:
+        """Answers that no later word of the same labeler on the same query has replaced."""
+        later = event.alias()
+        snapshot = self.sequence if upto is None else upto
+        same = (later.c.subject == event.c.subject) & (later.c.actor == event.c.actor)
+        after = same & (later.c.seq > event.c.seq) & (later.c.seq <= snapshot)
+        known = event.c.kind.in_(kinds) & (event.c.seq <= snapshot)
+        replaced = sql.exists().where(after, later.c.kind.in_((*ANSWERS, "retract")))
+        trains = sql.exists().where(asked.c.id == event.c.subject, asked.c.purpose == "label")
+        with self.log.reading() as connection:
+            for one in connection.execute(sql.select(event).where(known, ~replaced, trains).order_by(event.c.seq)):
+                yield read_answer(one.kind, one.subject, one.actor, one.body)
+
+    def events(self) -> Iterator[dict[str, Any]]:
         """The whole log, oldest first: what a lossless copy needs, beside the blobs."""
-        return [dict(one._mapping) for one in self._log.since(0)]
+        return self.log.since(0)
 
     def query(self, id: str) -> Query[C]:
-        """A query by its id, with its candidates."""
-        return Query(tuple(self.candidate(c) for c in self._refresh().queries[id]))
+        """A query by its id, with its candidates. Raises `StoreError` for one that was never asked."""
+        if id not in self._queries:
+            self._fetch([id])
+        return Query(tuple(self.candidate(c) for c in self._queries[id]))
 
     def candidate(self, id: str) -> C:
         """A candidate by its id, without gold. Segments are read from their blob once, and kept."""
         if id not in self._loaded:
-            self._loaded[id] = _load(id, self._view.candidates[id], self.folder / "blobs")
+            self._load({id})
         return self._loaded[id]
+
+    def _fetch(self, ids: Iterable[str]) -> None:
+        """Have queries and their candidates in memory, with few looks at the database."""
+        new = [id for id in dict.fromkeys(ids) if id not in self._queries]
+        bodies = self._bodies(new, "query")
+        self._queries |= {id: tuple(bodies[id]["candidates"]) for id in new}
+        self._load({c for id in new for c in self._queries[id]})
+
+    def _load(self, ids: set[str]) -> None:
+        new = [id for id in ids if id not in self._loaded]
+        for id, body in self._bodies(new, "candidate").items():
+            self._loaded[id] = load_candidate(id, body, self.folder / "blobs")
+
+    def _bodies(self, ids: Sequence[str], kind: str) -> dict[str, Any]:
+        """What was said of queries or candidates when they were asked."""
+        found: dict[str, Any] = {}
+        with self.log.reading() as connection:
+            for some in chunks(ids, CHUNK):
+                chosen = sql.select(event.c.id, event.c.body).where(event.c.id.in_(some), event.c.kind == kind)
+                found |= {one.id: one.body for one in connection.execute(chosen)}
+        if missing := [id for id in ids if id not in found]:
+            raise StoreError(f"the store in {self.folder} holds no {kind} {missing[0][:12]}")
+        return found
 
     def gold(self, candidates: Sequence[C]) -> list[Floats]:
         """The hidden values of candidates: for oracles and evaluation only."""
@@ -219,53 +237,41 @@ class Store(Generic[C]):
 
     def counts(self) -> dict[str, int]:
         """How many queries were asked, how many judgements and how many skips stand."""
-        view = self._refresh()
-        standing = view.standing()
-        skipped = sum(isinstance(a, Skip) for a in standing.values())
-        return {"asked": len(view.queries), "answered": len(standing) - skipped, "skipped": skipped}
-
-    def _refresh(self) -> _View:
-        for one in self._log.since(self._view.sequence):
-            self._view.read(one)
-        return self._view
+        columns = (sql.func.count(), sql.func.sum(asked.c.judged), sql.func.sum(asked.c.skipped + asked.c.incomparable))
+        with self.log.reading() as connection:
+            numbers = connection.execute(sql.select(*columns).where(asked.c.purpose == "label")).one()
+        return dict(zip(("asked", "answered", "skipped"), (int(n or 0) for n in numbers), strict=True))
 
 
-def _describe(candidate: Candidate) -> dict[str, Any]:
-    if isinstance(candidate, Segment):
-        return {"type": "segment", "episode": candidate.episode, "start": candidate.start, "steps": len(candidate)}
-    tokens = {"prompt_tokens": list(candidate.prompt_tokens), "tokens": list(candidate.tokens)}
-    return {"type": "response", "prompt": candidate.prompt, "text": candidate.text, **tokens}
+class _Asked:
+    """The candidates of queries by id: those of a store, and those that are about to be merged."""
+
+    def __init__(self, store: Store[Any]) -> None:
+        self._store, self._new = store, dict[str, list[str]]()
+
+    def __setitem__(self, id: str, candidates: list[str]) -> None:
+        self._new[id] = candidates
+
+    def __getitem__(self, id: str) -> list[str]:
+        return self._new[id] if id in self._new else [c.id for c in self._store.query(id).candidates]
+
+    def __contains__(self, id: str) -> bool:
+        if id in self._new:
+            return True
+        with self._store.log.reading() as connection:
+            return connection.scalar(sql.select(asked.c.id).where(asked.c.id == id)) is not None
 
 
-def _load(id: str, body: dict[str, Any], blobs: Path) -> Any:
-    """A candidate from its description, and its arrays if it has any; its content must have the id it goes by."""
-    loaded: Candidate
-    if body["type"] == "response":
-        loaded = Response(body["prompt"], body["text"], tuple(body["prompt_tokens"]), tuple(body["tokens"]))
-    else:
-        x = read_arrays(blobs, id)
-        loaded = Segment(x["observations"], x["actions"], body["episode"], body["start"], x.get("states"))
-    if loaded.id != id:
-        raise StoreError(f"candidate {id[:12]} has changed since it was filed: its sha256 is now {loaded.id[:12]}")
-    return loaded
-
-
-def _check_event(one: dict[str, Any], queries: dict[str, list[str]], candidates: dict[str, Any], blobs: Path) -> None:
-    """Check an event from elsewhere against those before it, and remember it if later ones may speak of it."""
-    if not all(isinstance(one[name], str) for name in ("id", "kind", "subject", "actor", "at")):
-        raise TypeError("id, kind, subject, actor and at must be strings")
-    if one["kind"] == "candidate":
-        candidates[one["id"]] = _load(one["id"], one["body"], blobs)
-    elif one["kind"] == "query":
-        queries[one["id"]] = _check_query(one["id"], one["body"], candidates)
-    elif one["subject"] not in queries:
-        raise StoreError(f"it speaks of query {one['subject'][:12]}, which is not there")
-    elif not one["id"].startswith(f"{one['subject']}:{one['actor']}:"):
-        raise StoreError(f"its id {one['id'][:20]} is not that of an answer to its query by its labeler")
-    elif one["kind"] in ANSWERS:
-        _check_size(_answer(one["kind"], one["subject"], one["actor"], one["body"]), len(queries[one["subject"]]))
-    elif one["kind"] != "retract":
-        raise StoreError(f"unknown kind {one['kind']!r}")
+def _sizes(tx: Transaction, ids: Iterable[str]) -> dict[str, int]:
+    """How many candidates each query has, of those that were asked."""
+    found: dict[str, int] = {}
+    for some in chunks(ids, CHUNK):
+        if len(some) == 1:
+            rows = tx.connection.execute(_SIZE, {"b_id": some[0]})
+        else:
+            rows = tx.connection.execute(sql.select(asked.c.id, asked.c.size).where(asked.c.id.in_(some)))
+        found |= {one.id: one.size for one in rows}
+    return found
 
 
 def _check_size(answer: Answer, size: int) -> None:
@@ -273,16 +279,3 @@ def _check_size(answer: Answer, size: int) -> None:
         check_fits(answer, size)
     except ValueError as error:
         raise StoreError(str(error)) from None
-
-
-def _check_query(id: str, body: dict[str, Any], candidates: dict[str, Any]) -> list[str]:
-    """The candidates of a query from elsewhere; they must be there, and make up its id."""
-    if Query(tuple(candidates[c] for c in body["candidates"])).id != id:
-        raise StoreError(f"query {id[:12]} does not have the sha256 of its candidates")
-    return list(body["candidates"])
-
-
-def _answer(kind: str, query: str, labeler: str, body: dict[str, Any]) -> Answer:
-    """The answer that an event holds; JSON has lists where answers have tuples."""
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in body.items()}
-    return ANSWERS[kind](query=query, labeler=labeler, **values)

@@ -1,3 +1,4 @@
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -6,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy.exc import DatabaseError
 
 from prefrl.files import DamagedError
-from prefrl.log import StoreError
+from prefrl.log import StoreError, StoreFull
+from prefrl.maintenance import verify_store
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 
@@ -131,6 +132,7 @@ def test_every_answer_is_on_disk_when_the_process_is_killed(tmp_path: Path) -> N
     code = f"""
 import os, signal, numpy as np
 from pathlib import Path
+from prefrl.maintenance import verify_store
 from prefrl.store import Store
 from prefrl.types import *
 store = Store(Path({str(tmp_path)!r}))
@@ -185,15 +187,57 @@ def test_any_database_will_do(tmp_path: Path, make_query: Ask) -> None:
 def test_a_full_disk_is_an_error_and_loses_nothing(store: Store[Segment], make_query: Ask) -> None:
     kept = make_query()
     store.ask([kept])
-    with store._log._engine.connect() as connection:
+    assert store.log._writer is not None
+    with store.log._writer.connect() as connection:
         pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
         connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
-    with pytest.raises(DatabaseError, match="full"):
-        store.ask([make_query() for _ in range(200)])
+    late = [make_query() for _ in range(200)]
+    with pytest.raises(StoreFull, match="is full"):
+        store.ask(late)
     assert [q.id for q in store.open_queries()] == [kept.id]
+    with store.log._writer.connect() as connection:
+        connection.exec_driver_sql("PRAGMA max_page_count=1000000")
+    store.ask(late)  # there is room again
+    assert len(store.open_queries()) == 201
 
 
 def test_of_two_answers_given_at_once_the_first_stands(store: Store[Segment], make_query: Ask) -> None:
     store.ask([query := make_query()])
     store.answer([Comparison(query.id, 1.0, "me"), Comparison(query.id, 0.0, "me")])
     assert store.judged()[0].judgement == Comparison(query.id, 1.0, "me")
+
+
+def test_a_store_of_the_first_version_is_brought_up_to_date_after_a_copy(tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
+    with pytest.raises(StoreError, match="made by an older prefrl"):
+        Store[Response](tmp_path, write=False)
+    with Store[Response](tmp_path) as store:
+        assert store.counts() == {"asked": 4, "answered": 5, "skipped": 2}
+        assert store.sequence == 23
+        assert {(j.judgement.labeler, type(j.judgement).__name__) for j in store.judged()} == {
+            ("ann", "Ranking"),
+            ("ann", "Comparison"),
+            ("bob", "Comparison"),
+            ("bob", "Choice"),
+            ("bob", "Rating"),
+        }
+    assert verify_store(tmp_path).faults == []
+    (copy,) = (tmp_path / "backups").iterdir()
+    with sqlite3.connect(copy) as connection:
+        assert connection.execute("SELECT value FROM meta WHERE key = 'schema'").fetchall() == [("1",)]
+    connection.close()
+
+
+def test_migrations_make_the_tables_that_new_stores_have(tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
+    Store[Response](tmp_path).close()
+    Store[Response](tmp_path / "new").close()
+
+    def described(path: Path) -> set[tuple[str, str, str]]:
+        with sqlite3.connect(path) as connection:
+            of_ours = "SELECT type, name, tbl_name FROM sqlite_master WHERE name <> 'sqlite_sequence'"
+            rows = connection.execute(of_ours).fetchall()
+        connection.close()
+        return set(rows)
+
+    assert described(tmp_path / "store.db") == described(tmp_path / "new" / "store.db")

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from prefrl.label.exchange import import_judgements
 from prefrl.label.formats import Which
+from prefrl.projection import ANSWERS
 from prefrl.store import Store
 from prefrl.types import Judged, Segment
 
@@ -46,9 +47,9 @@ def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
     if which.split:
         raise ValueError(f"{source} is a store, which knows no split: give a file, or leave the split out")
     with Store[Any](source, write=False) as whole:
-        events = whole.events()
+        events = list(whole.events())
     asked = [e for e in events if e["kind"] in ("candidate", "query")]
-    answers = [e for e in events if e["kind"] not in ("candidate", "query") and which.takes(e["actor"])]
+    answers = [e for e in events if e["kind"] in (*ANSWERS, "retract") and which.takes(e["actor"])]
     if not answers:
         known = ", ".join(sorted({e["actor"].partition("#")[0] for e in events} - {""})) or "none"
         raise ValueError(f"{source}: no judgement by {', '.join(which.labelers)}; labelers there: {known}")

@@ -1,0 +1,1 @@
+"""A page for people who label, and what stands behind it."""
