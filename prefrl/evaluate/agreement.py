@@ -10,6 +10,7 @@ from scipy.special import expit, log_expit, logsumexp
 
 from prefrl.evaluate.card import Bucket, Estimate, LabelerPart, Members, undefined
 from prefrl.evaluate.intervals import share
+from prefrl.raters import cohen
 from prefrl.types import Floats, Integers
 
 BUCKETS = 4
@@ -117,10 +118,8 @@ def kappa(one: npt.NDArray[np.bool_], other: npt.NDArray[np.bool_]) -> Estimate:
     """Cohen's kappa of two raters who each name the first (true) or the second of M candidates (Cohen 1960)."""
     if not len(one):
         return undefined("no comparison of this sort")
-    chance = float(one.mean() * other.mean() + (1 - one.mean()) * (1 - other.mean()))
-    if chance == 1.0:
-        return undefined("both always name the same side")
-    return Estimate(value=(float((one == other).mean()) - chance) / (1 - chance), count=len(one))
+    value = cohen(one.astype(np.int64), other.astype(np.int64))
+    return undefined("both always name the same side") if value is None else Estimate(value=value, count=len(one))
 
 
 def member_part(pairs: Pairs, rng: np.random.Generator) -> Members:
