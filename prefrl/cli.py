@@ -86,17 +86,30 @@ def label(
         Path | None, typer.Option(help='JSON lines {"prompt", "responses"} to ask about.', exists=True)
     ] = None,
     terminal: Annotated[bool, typer.Option(help="Short for labeler.kind=terminal.")] = False,
+    serve: Annotated[
+        bool, typer.Option(help="Short for labeler.kind=web; of a folder with a store, its open queries are answered.")
+    ] = False,
+    host: Annotated[str, typer.Option(help="With --serve: labeler.host.")] = "",
+    port: Annotated[int | None, typer.Option(help="With --serve: labeler.port.")] = None,
 ) -> None:
     """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
     from prefrl import stages
     from prefrl.console import say
     from prefrl.rundir import open_saved
 
-    policy = open_saved(source) if Path(source).is_dir() else None
-    path = str(policy.folder / "config.yaml") if policy else source
     extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(out / 'clips'))}"] if terminal else []
+    if serve:
+        extra = ["labeler.kind=web", *[f"labeler.host={host}"] * bool(host)]
+        extra += [f"labeler.port={port}"] * (port is not None)
+    there = serve and (Path(source) / "store.db").exists()
+    policy = open_saved(source) if Path(source).is_dir() and not there else None
+    path = str(policy.folder / "config.yaml") if policy else source
+    settings = [*extra, *(overrides or [])]
     try:
-        counts = stages.label(_load(path, [*extra, *(overrides or [])]), out, policy, given)
+        if there:
+            out, counts = Path(source), stages.serve(Path(source), settings, say)
+        else:
+            counts = stages.label(_load(path, settings), out, policy, given, say)
     except KeyboardInterrupt:
         say(f"stopped; what was answered is in {out}. Go on with the same command")
         raise

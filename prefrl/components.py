@@ -47,6 +47,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",
         "terminal": "prefrl.label.terminal:TerminalSettings",
+        "web": "prefrl.label.web:WebSettings",
     },
     "rewards": {
         "mlp": "prefrl.reward_models.mlp:MLPSettings",
@@ -79,6 +80,9 @@ EXTRAS = {
     "peft": "text",
     "vaderSentiment": "text",
     "av": "label",
+    "fastapi": "label",
+    "starlette": "label",
+    "uvicorn": "label",
 }
 
 

@@ -75,7 +75,7 @@ def drive(running: Run) -> None:
     with running:
         for note in running.notes:
             say(note, "yellow")
-        person = running.config.labeler.model_dump()["kind"] == "terminal"
+        person = running.config.labeler.model_dump()["kind"] in ("terminal", "web")
         try:
             with progress(running.loop, quiet=person) as bar:
                 for round in running:

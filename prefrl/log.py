@@ -273,9 +273,10 @@ def _set_head(connection: Connection, seq: int, hash: str) -> None:
         connection.execute(sql.insert(meta), {"key": "head", "value": value})
 
 
-def _says_full(error: OperationalError) -> bool:
-    text = str(error.orig).lower()
-    return "disk is full" in text or "no space left" in text or "could not extend" in text
+def _says_full(error: BaseException | None) -> bool:
+    """Whether an error, or one that it hides, is that of a full disk: SQLite then drops savepoints, and says so last."""
+    words = ("disk is full", "no space left", "could not extend")
+    return error is not None and (any(w in str(error).lower() for w in words) or _says_full(error.__context__))
 
 
 __all__ = [

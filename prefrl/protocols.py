@@ -6,7 +6,7 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -136,6 +136,20 @@ class Labeler(Protocol[C]):
         """Answer open queries of the store: all of them now (an oracle), or as far as people have come."""
 
 
+@runtime_checkable
+class Attended(Protocol):
+    """A labeler for whom something must stand open while the store does: a page that people come to."""
+
+    def open(self, store: Store[Any], fixed: bool = False) -> list[str]:
+        """Open it on a store that can be written to; returns what people should know, such as a link.
+
+        `fixed`: no more will be asked than the store holds, and `answer` is to wait until all of it is answered.
+        """
+
+    def close(self) -> None:
+        """Close it, before the store is closed. Does nothing where it is not open."""
+
+
 class Store(Protocol[C]):
     """Every behaviour asked about and every answer given, append-only."""
 
@@ -256,6 +270,7 @@ class Selector(Protocol[C]):
 
 
 __all__ = [
+    "Attended",
     "ControlTask",
     "Environments",
     "Labeler",

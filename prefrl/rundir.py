@@ -23,7 +23,7 @@ from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.files import MANIFEST, DamagedError, verify, whole_folder, write_file
 from prefrl.grading import discount_of, grade, of_run
 from prefrl.loop import Loop
-from prefrl.protocols import RewardModel, Task
+from prefrl.protocols import Attended, RewardModel, Task
 from prefrl.seeding import streams
 from prefrl.store import Store
 from prefrl.types import Round
@@ -59,6 +59,8 @@ class Run:
             self._rows = self._restore()
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
             self._events = _events(self.folder, self.loop.round)
+            if isinstance(self.loop.labeler, Attended):
+                self.notes += self.loop.labeler.open(self.store)
         except BaseException:
             self.store.close()
             raise
@@ -75,7 +77,9 @@ class Run:
         self.close()
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Let go of the folder; people can answer until then."""
+        if isinstance(self.loop.labeler, Attended):
+            self.loop.labeler.close()
         self._events.close()
         self.store.close()
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,13 +23,23 @@ from prefrl.grading import Subject, discount_of, grade, judgements, of_run
 from prefrl.graph import batch
 from prefrl.label.formats import Which
 from prefrl.label.source import open_judgements
+from prefrl.protocols import Attended
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
 from prefrl.store import Store
 from prefrl.types import Evaluation, Fitted, Query, Response
 
+Tell = Callable[[str], None]
+"""How a person is told something while a stage goes on."""
 
-def label(config: Config, folder: Path, policy: Saved | None = None, given: Path | None = None) -> dict[str, int]:
+
+def label(
+    config: Config,
+    folder: Path,
+    policy: Saved | None = None,
+    given: Path | None = None,
+    tell: Tell = lambda _: None,
+) -> dict[str, int]:
     """Ask `loop.labels` queries in the store of a folder, and have the labeler answer them; returns the counts.
 
     Candidates come from the starting policy, from a run's `policy`, or from a file of `given` responses. Calling it
@@ -47,8 +59,40 @@ def label(config: Config, folder: Path, policy: Saved | None = None, given: Path
             store.ask(read_queries(given, loop.task))
         else:
             loop.ask(config.loop.labels - asked, streams(config.seed, 1 + asked))
-        loop.labeler.answer(store, streams(config.seed, 1).label)
+        with attended(loop.labeler, store, tell):
+            loop.labeler.answer(store, streams(config.seed, 1).label)
         return store.counts()
+
+
+def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: None) -> dict[str, int]:
+    """Have people answer what was asked in the store of a folder, until nothing is left; returns the counts.
+
+    The settings of the page are the folder's own, if it has any. Raises `RunError` where there is no store, and
+    `StoreError` where a run that goes on has it.
+    """
+    if not (folder / "store.db").exists() and not (folder / "store.url").exists():
+        raise RunError(f"{folder} holds no store: expected the folder of a run, or of `prefrl label`")
+    saved_config(folder)  # says what is missing, if it is
+    settings: Any = Config.load(folder / "config.yaml", ["labeler.kind=web", *overrides])
+    with Store[Any](folder) as store:
+        labeler = settings.labeler.build(settings.task.build())
+        with attended(labeler, store, tell):
+            labeler.answer(store, streams(settings.seed, 1).label)
+        return store.counts()
+
+
+@contextmanager
+def attended(labeler: Any, store: Store[Any], tell: Tell) -> Iterator[None]:
+    """Have open what a labeler's people come to, if there is such a thing; nothing more will be asked."""
+    if not isinstance(labeler, Attended):
+        yield
+        return
+    try:
+        for note in labeler.open(store, fixed=True):
+            tell(note)
+        yield
+    finally:
+        labeler.close()
 
 
 def read_queries(path: Path, task: Any) -> list[Query[Response]]:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN_BY_CI = {"make demo", "make test", "source .venv/bin/activate"}
+RUN_BY_CI = {"make demo", "make test", "source .venv/bin/activate", "pip install 'prefrl[label]'"}
 """CI runs these by themselves, before or around the tests."""
+SERVES = re.compile("--serve|labeler.kind=web")
+"""Commands that wait for people; the browser's tests answer them."""
 
 
 def blocks(path: Path) -> list[tuple[str, str]]:
@@ -28,19 +31,43 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def environment() -> dict[str, str]:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return os.environ | {"PATH": path, "OMP_NUM_THREADS": "1"}
+
+
 def run(code: str, folder: Path) -> None:
     """Run shell commands there, with somebody at the keyboard who always presses 1."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for line in code.splitlines():
+        if SERVES.search(line):
+            serve(line, folder)
+    code = "\n".join(line for line in code.splitlines() if not SERVES.search(line))
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", code],
         cwd=folder,
-        env=os.environ | {"PATH": path, "OMP_NUM_THREADS": "1"},
+        env=environment(),
         input="1\n" * 100,
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, f"{code}\n{done.stdout}\n{done.stderr}"
+
+
+def serve(command: str, folder: Path) -> None:
+    """Start a command that waits for people; once it has printed its link, interrupt it."""
+    serving = subprocess.Popen(
+        ["bash", "-c", f"exec {command}"], cwd=folder, env=environment(), stdout=subprocess.PIPE, text=True
+    )
+    assert serving.stdout is not None
+    said = ""
+    while "http://127.0.0.1" not in said:
+        line = serving.stdout.readline()
+        assert line, f"{command}\n{said}"
+        said += line
+    serving.send_signal(signal.SIGINT)
+    assert serving.wait(30) == 130
+    serving.stdout.close()
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """What is built and shipped: a wheel with everything in it, a schema that is up to date."""
 
+import re
 import shutil
 import subprocess
 import sys
+import urllib.request
 import zipfile
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +14,8 @@ import pytest
 from prefrl.schema import schema, text
 
 ROOT = Path(__file__).parent.parent
+SHIPPED = (".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed")
+PAGES = "prefrl/label/server/pages"
 
 
 def test_the_shipped_schema_is_up_to_date() -> None:
@@ -41,33 +45,42 @@ def test_a_wheel_holds_one_top_level_name_and_every_file_that_is_needed(wheel: P
         for p in (ROOT / folder).rglob("*.*")
     }
     here |= {p.relative_to(ROOT / "prefrl").as_posix() for p in (ROOT / "prefrl").rglob("*.*")}
-    wanted = {f"prefrl/{name}" for name in here if name.endswith((".py", ".yaml", ".json", ".html", ".css", ".typed"))}
+    wanted = {
+        f"prefrl/{name}"
+        for name in here
+        if name.endswith((".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed"))
+    }
     assert {name for name in names if ".dist-info/" not in name} == wanted
     assert not [name for name in names if "test" in name]
 
 
-@pytest.mark.slow
-def test_an_installed_wheel_works_without_the_tree(wheel: Path, tmp_path: Path) -> None:
-    install = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-deps",
-        "--target",
-        str(tmp_path / "site"),
-        str(wheel),
-    ]
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The command that starts prefrl from an installed wheel, and says where it comes from."""
+    site = tmp_path_factory.mktemp("site")
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
-    code = "import sys; sys.path.insert(0, sys.argv.pop(1)); from prefrl import cli; print(cli.__file__); cli.main()"
+    imports = "import sys; sys.path.insert(0, sys.argv.pop(1)); from prefrl import cli"
+    return [sys.executable, "-c", f"{imports}; print(cli.__file__, flush=True); cli.main()", str(site)]
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_works_without_the_tree(installed: list[str], tmp_path: Path) -> None:
     for arguments in (["presets"], ["run", "control/toy", "--out", "run"]):
-        done = subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path / "site"), *arguments],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        command = [*installed, *arguments]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-        assert str(tmp_path / "site") in done.stdout
+        assert installed[-1] in done.stdout
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_serves_the_page(installed: list[str], tmp_path: Path) -> None:
+    command = [*installed, "run", "control/toy", "labeler.kind=web", "labeler.port=0", "--out", "run"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as serving:
+        assert serving.stdout is not None
+        link = next(found for line in serving.stdout if (found := re.search(r"http://\S+/", line)))
+        for name in ("", "static/app.js", "static/base.css"):
+            with urllib.request.urlopen(link[0] + name) as response:
+                page = response.read()
+            assert page == (ROOT / PAGES / name).read_bytes() if name else b"<title>" in page
+        serving.terminate()

@@ -241,3 +241,22 @@ def test_migrations_make_the_tables_that_new_stores_have(tmp_path: Path) -> None
         return set(rows)
 
     assert described(tmp_path / "store.db") == described(tmp_path / "new" / "store.db")
+
+
+def test_a_disk_that_fills_up_inside_a_savepoint_is_said_to_be_full(text_store: Store[Response]) -> None:
+    queries = [Query((Response(f"p{i}", "a"), Response(f"p{i}", "b"))) for i in range(400)]
+    text_store.ask(queries)
+    assert text_store.log._writer is not None
+    with text_store.log._writer.connect() as connection:
+        pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
+        connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
+
+    def fill() -> None:
+        with text_store.log.transaction() as tx:
+            for query in queries:
+                with tx.savepoint():
+                    text_store.put(tx, Comparison(query.id, 1.0), {"comment": "x" * 500})
+
+    with pytest.raises(StoreFull, match="is full"):
+        fill()
+    assert text_store.judged() == []

@@ -13,7 +13,7 @@ COMMENT = 4000
 """Characters of a comment at most."""
 HISTORY = 50
 """How many of one's last answers can be looked at and taken back."""
-AHEAD = 4
+AHEAD = 6
 """Questions that one person may hold at once: the one shown, and those fetched ahead."""
 
 
@@ -141,7 +141,7 @@ class Page(Plain):
 
 class Progress(Plain):
     mine: int
-    """Judgements of this person that stand."""
+    """Answers of this person that stand, skips among them."""
     answered: int
     """Questions with all the answers they need."""
     asked: int

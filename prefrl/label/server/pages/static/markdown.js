@@ -1,0 +1,112 @@
+/**
+ * A small and safe part of Markdown: headings, lists, quotes, code, rules, bold, italic.
+ *
+ * It makes nodes, never markup. There are no images, no HTML and no links to click: an address is shown as text.
+ */
+
+import { el } from "./dom.js";
+
+/**
+ * Code, bold, bold, italic, italic, link. Spans have a longest length, and no pattern can match one text in many ways:
+ * hostile text costs no more than any other.
+ */
+const SPANS = [
+  /(?<!`)(`{1,3})(?!`)([\s\S]{0,1000}?[^`])\1(?!`)/u,
+  /\*\*(?=\S)([\s\S]{0,400}?\S)\*\*/u,
+  /__(?=\S)([\s\S]{0,400}?\S)__/u,
+  /\*(?=[^\s*])([^*]*?[^\s*])\*/u,
+  /(?<![\p{L}\p{N}])_(?=[^\s_])([^_]*?[^\s_])_(?![\p{L}\p{N}])/u,
+  /!?\[([^\]\n]{0,500})\]\(([^)\s]{0,2000})\)/u,
+];
+const INLINE = new RegExp(SPANS.map((one) => one.source).join("|"), "gu");
+const FENCE = /^\s{0,3}(```+|~~~+)/;
+const HEADING = /^(#{1,6})[ \t]+(\S[^\n]*)$/;
+const RULE = /^\s{0,3}([-*_])(\s*\1){2,}\s*$/;
+const BULLET = /^(\s{0,8})(?:[-*+]|(\d{1,9})[.)])[ \t]+([^\n]*)$/;
+const QUOTE = /^\s{0,3}>[ \t]?([^\n]*)$/;
+const DEEP = 6;
+
+/** A text as nodes. */
+export function markdown(text, depth = 0) {
+  const lines = text.split("\n");
+  const out = [];
+  let at = 0;
+  while (at < lines.length) {
+    const [node, next] = block(lines, at, depth);
+    if (node) out.push(node);
+    at = next;
+  }
+  return out;
+}
+
+function block(lines, at, depth) {
+  const line = lines[at];
+  if (!line.trim()) return [null, at + 1];
+  if (FENCE.test(line)) return fence(lines, at);
+  const heading = HEADING.exec(line);
+  if (heading)
+    return [el(`h${Math.min(6, heading[1].length + 1)}`, { dir: "auto" }, inline(heading[2].trimEnd())), at + 1];
+  if (RULE.test(line)) return [el("hr"), at + 1];
+  if (QUOTE.test(line) && depth < DEEP) return quote(lines, at, depth);
+  if (BULLET.test(line)) return list(lines, at);
+  return paragraph(lines, at);
+}
+
+function fence(lines, at) {
+  const mark = FENCE.exec(lines[at])[1];
+  let end = at + 1;
+  while (end < lines.length && !lines[end].trim().startsWith(mark)) end += 1;
+  return [el("pre", {}, el("code", { text: lines.slice(at + 1, end).join("\n") })), end + 1];
+}
+
+function quote(lines, at, depth) {
+  let end = at;
+  while (end < lines.length && QUOTE.test(lines[end])) end += 1;
+  const inner = lines
+    .slice(at, end)
+    .map((line) => QUOTE.exec(line)[1])
+    .join("\n");
+  return [el("blockquote", { dir: "auto" }, markdown(inner, depth + 1)), end];
+}
+
+/** Deeper items are indented, not nested: a judge needs the look, not the tree. */
+function list(lines, at) {
+  const ordered = BULLET.exec(lines[at])[2] !== undefined;
+  const node = ordered ? el("ol", { start: BULLET.exec(lines[at])[2] }) : el("ul");
+  let end = at;
+  for (; end < lines.length; end++) {
+    const item = BULLET.exec(lines[end]);
+    if (item)
+      node.append(
+        el("li", { dir: "auto", class: `depth-${Math.min(3, Math.floor(item[1].length / 2))}` }, inline(item[3])),
+      );
+    else if (/^\s{2,}\S/.test(lines[end])) node.lastChild.append(" ", ...inline(lines[end].trim()));
+    else break;
+  }
+  return [node, end];
+}
+
+function paragraph(lines, at) {
+  let end = at + 1;
+  const stop = (line) =>
+    !line.trim() || FENCE.test(line) || HEADING.test(line) || BULLET.test(line) || QUOTE.test(line);
+  while (end < lines.length && !stop(lines[end])) end += 1;
+  return [el("p", { dir: "auto" }, inline(lines.slice(at, end).join("\n"))), end];
+}
+
+function inline(text) {
+  const nodes = [];
+  let last = 0;
+  for (const match of text.matchAll(INLINE)) {
+    nodes.push(text.slice(last, match.index), span(match));
+    last = match.index + match[0].length;
+  }
+  return [...nodes, text.slice(last)];
+}
+
+function span([, , code, strong, strong2, slanted, slanted2, label, address]) {
+  if (code !== undefined) return el("code", { text: code });
+  if (strong ?? strong2) return el("strong", { text: strong ?? strong2 });
+  if (slanted ?? slanted2) return el("em", { text: slanted ?? slanted2 });
+  return el("span", { class: "address" }, el("span", { text: label }), el("code", { text: address }));
+}

@@ -1,0 +1,212 @@
+/** One question on the page: what is asked, the candidates, and the ways to answer. */
+
+import { el, icon } from "./dom.js";
+import { cap, listen } from "./keys.js";
+import { Player } from "./player.js";
+import { Ranking } from "./ranking.js";
+import { Stopwatch } from "./stopwatch.js";
+import { promptView, Responses } from "./textview.js";
+import { t } from "./strings.js";
+import { transport } from "./transport.js";
+import { means, verdict } from "./verdict.js";
+
+/** No one judges faster than this, but a key or a double click may still be meant for the question before. */
+const GUARD = 300;
+
+export class Question {
+  #page;
+  #assignment;
+  #answer;
+  #earlier;
+  #locked = true;
+  #given = false;
+  #watch = new Stopwatch();
+  #stops = [];
+  #player = null;
+  #responses = null;
+  #ranking = null;
+  #choices = [];
+  #note = el("p", { class: "gate", role: "status", testid: "gate", hidden: true });
+
+  /** `answer(body, event)` gets what the server wants, less its ids; `tools` are buttons for the end of the bar. */
+  constructor(assignment, { page, player, earlier, answer, tools }) {
+    this.#assignment = assignment;
+    this.#page = page;
+    this.#answer = answer;
+    this.#earlier = earlier ?? null;
+    this.element = this.#build(player, tools);
+    this.#open();
+  }
+
+  /** Take the keys away and stop the clips. */
+  close() {
+    this.#given = true;
+    this.#stops.forEach((stop) => stop());
+    this.#player?.close();
+    this.#responses?.close();
+    this.#watch.stop();
+  }
+
+  /** Show which answer was taken, while the next question comes. */
+  confirm(outcome) {
+    this.#given = true;
+    this.element.dataset.chosen = outcome;
+  }
+
+  focus() {
+    this.element.querySelector("h1").focus({ preventScroll: true });
+  }
+
+  get #pair() {
+    return this.#assignment.items.length === 2;
+  }
+
+  #build(player, tools) {
+    const { items, kind } = this.#assignment;
+    const film = items.some((item) => item.media.length);
+    if (film) this.#player = player ?? new Player(items);
+    else this.#responses = new Responses(items, this.#page);
+    const prompt = promptView(this.#assignment.prompt);
+    if (prompt) this.#stops.push(prompt.close);
+    const bar = this.#bar(tools);
+    this.#choices = bar.buttons;
+    const controls = this.#player && transport(this.#player);
+    const ranking = this.#pair ? null : this.#rank(items);
+    this.#listen(bar.actions, controls?.actions);
+    const element = el(
+      "article",
+      {
+        class: `question ${film ? "film" : "text"} ${ranking ? "many" : "pair"}`,
+        testid: "question",
+        data: { id: this.#assignment.assignment_id, kind, count: String(items.length), ready: "false" },
+      },
+      el("h1", { class: "asked", tabindex: "-1", text: this.#page.question }),
+      prompt?.element,
+      this.#responses?.toolbar,
+      el(
+        "div",
+        { class: "stage" },
+        el(
+          "div",
+          { class: "slots" },
+          items.map((item, at) => this.#slot(item, at)),
+        ),
+      ),
+      controls?.element,
+      ranking?.element,
+      bar.element,
+    );
+    cap(element);
+    return element;
+  }
+
+  #slot(item, at) {
+    const body = this.#player ? this.#player.clips[at].element : this.#responses.elements[at];
+    return el(
+      "section",
+      {
+        class: "slot",
+        testid: `slot-${at}`,
+        data: { slot: String(at) },
+        "aria-label": t("slot.name", { slot: at + 1 }),
+      },
+      el(
+        "header",
+        { class: "slot-head" },
+        el("span", { class: "badge", data: { slot: String(at) }, text: String(at + 1) }),
+        el("span", { class: "chosen-mark", "aria-hidden": "true" }, icon("check")),
+      ),
+      body,
+    );
+  }
+
+  #bar(tools) {
+    return verdict({
+      pair: this.#pair,
+      strength: this.#page.strength,
+      earlier: this.#earlier,
+      note: this.#note,
+      tools,
+      answer: (chosen, event) => this.#give(chosen, event),
+    });
+  }
+
+  #rank(items) {
+    const submit = (order, event) =>
+      this.#give({ outcome: "ranking", ranking: order.ranks, touched: order.touched }, event);
+    this.#ranking = new Ranking(items, submit, this.#earlier?.ranking, this.#player?.clips);
+    return this.#ranking;
+  }
+
+  #listen(...groups) {
+    const ranking = this.#ranking;
+    this.#stops.push(listen(Object.assign({}, ...groups, ranking?.actions), ranking?.digit));
+  }
+
+  /** Answers are taken when all is there to be seen, and a moment has passed. */
+  async #open() {
+    if (this.#player) {
+      this.#player.addEventListener("time", () => this.#gate());
+      this.#player.addEventListener("failed", () => this.#gate());
+      this.#gate();
+      await this.#player.ready;
+      this.element.style.setProperty("--shape", String(Math.max(...this.#player.clips.map((clip) => clip.shape))));
+    }
+    await new Promise((resolve) => setTimeout(resolve, GUARD));
+    this.#locked = false;
+    this.#watch.ready();
+    this.element.dataset.ready = "true";
+    this.#gate();
+  }
+
+  /** Begin to play, once the question is on the page. */
+  begin() {
+    this.#player?.begin();
+    this.#player?.ready.then(() => this.#gate());
+  }
+
+  /** Why an answer other than a skip cannot be given yet, or "". */
+  get #closed() {
+    if (!this.#player) return "";
+    if (this.#player.failed) return t("gate.broken");
+    const share = Math.min(1, ...this.#player.watched);
+    if (share + 1e-9 >= this.#page.minimum_watched) return "";
+    const percent = Math.round(100 * this.#page.minimum_watched);
+    return t("gate.watch", { percent, done: Math.floor(100 * share) });
+  }
+
+  #gate() {
+    const reason = this.#closed;
+    const gate = this.#note;
+    const idle =
+      this.#player && !this.#player.playing && !this.#player.failed && this.#player.time * this.#player.fps < 1;
+    const words = reason || (idle && this.element.dataset.ready === "true" ? t("gate.play") : "");
+    if (gate.textContent !== words) gate.textContent = words;
+    gate.hidden = !words;
+    this.element.dataset.gate = this.#player?.failed ? "broken" : reason ? "watch" : "";
+    if (this.#ranking) this.#ranking.disabled = Boolean(reason);
+    for (const node of this.#choices) node.disabled = Boolean(reason) && node.dataset.action !== "skip";
+    const verdictBar = this.element.querySelector(".verdict");
+    verdictBar.setAttribute("aria-disabled", String(this.element.dataset.ready !== "true"));
+  }
+
+  /** A clip that never comes must not keep a person: a skip is taken at any time after the guard. */
+  #give(chosen, event) {
+    const skip = chosen.outcome === "skip";
+    if (this.#given || (this.#locked && !(skip && this.#waited)) || (this.#closed && !skip)) return;
+    this.#given = true;
+    const body = { ...chosen, timings: this.#timings(), input: means(event) };
+    if (this.#page.strength === false || !["first", "second"].includes(chosen.outcome)) body.strength = null;
+    this.#answer(body, event);
+  }
+
+  get #waited() {
+    return this.#watch.read().visible_ms > GUARD;
+  }
+
+  #timings() {
+    const player = this.#player;
+    if (!player) return this.#watch.read();
+    return { ...this.#watch.read(), replays: player.replays, speed: player.rate, watched: player.watched };
+  }
+}

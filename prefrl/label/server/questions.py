@@ -1,0 +1,96 @@
+"""What the desk gives out: open questions, the people they go to, and the rules by which they do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+Purpose: TypeAlias = Literal["label", "check", "repeat"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How questions are given out."""
+
+    overlap: int = 1
+    """How many different people each question goes to."""
+    lease_seconds: float = 120.0
+    check_share: float = 0.0
+    """Of what a person is given, about how much is a check question."""
+    repeat_share: float = 0.0
+    """Of what a person is given, about how much is a question of theirs with the sides turned round."""
+    seed: int = 0
+
+
+@dataclass
+class Question:
+    """A query that is open, or a check question."""
+
+    id: str
+    seq: int
+    batch: int
+    size: int
+    purpose: Purpose = "label"
+    answered: int = 0
+    """Judgements that stand, "cannot be compared" among them."""
+    seen: set[str] = field(default_factory=set)
+    """Who was given it, ever."""
+    leases: dict[str, float] = field(default_factory=dict)
+    """Who holds it, and until when."""
+    free: bool = False
+    """Whether somebody more can be given it; kept up by the desk."""
+
+    @property
+    def key(self) -> tuple[int, int, str]:
+        """The newest batch first, and within it the order of asking."""
+        return -self.batch, self.seq, self.id
+
+
+@dataclass(frozen=True)
+class Given:
+    """A question that was put to a person: an assignment."""
+
+    id: str
+    query: str
+    annotator: str
+    purpose: Purpose
+    shown: tuple[int, ...]
+    """`shown[slot]` is the candidate in that slot, counted in the query's own order."""
+    guideline: str = ""
+    """Version of the guideline at the time."""
+
+
+@dataclass
+class Past:
+    """What a person has done so far."""
+
+    given: int = 0
+    """Assignments, of whatever purpose."""
+    answers: int = 0
+    """Assignments that are answered."""
+    recent: list[Given] = field(default_factory=list)
+    """Open questions that were answered, oldest first: repeats are taken from them."""
+    repeated: set[str] = field(default_factory=set)
+
+
+@dataclass
+class Person:
+    """Where one person stands."""
+
+    past: Past | None = None
+    """None until it is told."""
+    held: dict[str, Given] = field(default_factory=dict)
+    """Given, and not answered; oldest first."""
+    undone: set[str] = field(default_factory=set)
+    """Assignments whose answers were taken back, and that wait for others."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Questions, check questions not among them."""
+
+    asked: int
+    answered: int
+    """With all the answers they need."""
+    leased: int
+    free: int

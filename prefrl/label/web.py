@@ -1,0 +1,180 @@
+"""People in a browser: a page with one question after the other, served from the process that owns the store."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+from rich.console import Console
+
+from prefrl.components import ConfigError, Settings, missing
+from prefrl.label.checks import pick_checks
+from prefrl.label.server.clips import ClipSettings
+from prefrl.protocols import Store, Task
+from prefrl.types import C
+
+if TYPE_CHECKING:  # a run without people loads no web server
+    from prefrl.label.server.site import Site
+
+TELL_SECONDS = 30.0
+"""How often it is told how far people are."""
+
+
+class Strengths(Settings):
+    """How likely the preferred one is taken to be better."""
+
+    slight: float = Field(0.73, ge=0.5, le=1)
+    """Of "slightly better"."""
+    clear: float = Field(0.88, ge=0.5, le=1)
+    """Of "clearly better"."""
+    much: float = Field(0.95, ge=0.5, le=1)
+    """Of "much better"."""
+
+
+class WebSettings(Settings):
+    """Ask people in their browsers, while the run goes on."""
+
+    kind: Literal["web"] = "web"
+    name: str = "me"
+    """Whose link is printed; this person is an admin, and can invite others on the page."""
+    host: str = "127.0.0.1"
+    """The address to listen on; 0.0.0.0 for all of this machine's."""
+    port: int = Field(8900, ge=0, le=65535)
+    """0 takes any free one."""
+    allowed_hosts: tuple[str, ...] = ()
+    """Other names under which people reach the page, "lab.example.org" say."""
+    tls_cert: Path | None = None
+    """The certificate, PEM, for https."""
+    tls_key: Path | None = None
+    """Its key."""
+    overlap: int = Field(1, ge=1, le=20)
+    """How many different people each question goes to; an admin can change it on the page."""
+    when_empty: Literal["wait", "continue"] = "wait"
+    """Each round: wait until people have answered `enough`, or go on with what there is after the very first."""
+    enough: float = Field(0.5, gt=0, le=1)
+    """The share of all questions asked so far that must be judged before a round goes on."""
+    lease_seconds: float | None = Field(None, gt=0)
+    """After how long without a sign of life a question goes to somebody else (120 for clips, 600 for texts)."""
+    strength: bool = True
+    """Whether a preference can be slight, clear or much."""
+    strengths: Strengths = Strengths()
+    """What these mean as preferences; without a strength the preferred one is taken to be better for certain."""
+    guideline: str = ""
+    """How to judge, shown beside the questions; an admin can change it on the page."""
+    question: str = ""
+    """What is asked, in one sentence; "Which clip is better?" where it is left out."""
+    check_share: float = Field(0.05, ge=0, le=0.5)
+    """The share of questions with a clear answer, to find out whether a person looks. Nothing is learned from them."""
+    repeat_share: float = Field(0.05, ge=0, le=0.5)
+    """The share of questions that are asked of the same person again, with the sides turned round."""
+    minimum_watched: float = Field(0.0, ge=0, le=1)
+    """The share of each clip that must be seen before an answer."""
+    markdown: bool = False
+    """Whether people may have responses shown as markdown."""
+    break_minutes: float = Field(30.0, ge=0)
+    """After how long at work a break is suggested; 0 for never."""
+    requests_per_second: float = Field(10.0, gt=0)
+    """How many requests one person may make."""
+    seed: int = Field(0, ge=0)
+    """Of the order of sides, and of when checks and repeats come."""
+    clips: ClipSettings = ClipSettings()
+    """How clips are drawn and kept."""
+
+    @field_validator("name")
+    @classmethod
+    def _can_be_a_name(cls, name: str) -> str:
+        from prefrl.label.server.access import check_name
+
+        return check_name(name)
+
+    @model_validator(mode="after")
+    def _whole(self) -> WebSettings:
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise ValueError("tls_cert and tls_key go together: give both or none")
+        if self.check_share + self.repeat_share >= 1:
+            raise ValueError("check_share and repeat_share together must leave room for questions")
+        return self
+
+    def build(self, task: Task) -> WebLabeler:
+        return WebLabeler(self, task)
+
+
+@dataclass
+class WebLabeler:
+    """A `prefrl.protocols.Attended`: `open` starts the page, `answer` waits for people, `close` ends the page.
+
+    While it is not open nobody can answer, and `answer` returns at once.
+    """
+
+    settings: WebSettings
+    task: Task
+    console: Console = field(default_factory=Console)
+    fixed: bool = False
+    """No more questions will come, and all are waited for."""
+    _site: Site | None = None
+    _checked: int = 0
+    """How many queries there were when check questions were last chosen."""
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
+
+    def open(self, store: Any, fixed: bool = False) -> list[str]:
+        """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
+        self.fixed = fixed
+        try:
+            from prefrl.label.server.site import open_site
+        except ModuleNotFoundError as error:
+            raise ConfigError(f"labeler kind 'web': {missing(error)}") from error
+        self._site = open_site(self, store)
+        return self._site.notes
+
+    def close(self) -> None:
+        """End the page. What was acknowledged is in the store."""
+        if self._site is not None:
+            self._site.close()
+            self._site = None
+
+    def answer(self, store: Store[C], rng: np.random.Generator) -> None:
+        """Wait until people have answered enough of what was asked; all of it, where no more will be asked."""
+        if self._site is None:
+            return
+        self._file_checks(store, rng)
+        self._site.service.refresh()
+        told = -math.inf
+        while (left := self._site.left() if self.fixed else self._missing()) > 0:
+            if time.monotonic() - told > TELL_SECONDS:
+                told = time.monotonic()
+                self._tell(left)
+            self._site.wait(1.0)
+        if self.fixed:
+            self._site.say_goodbye()
+
+    def _missing(self) -> int:
+        """How many more questions must be judged before a round goes on; what everybody skipped is let go."""
+        assert self._site is not None
+        asked, judged, stuck = self._site.judged()
+        share = self.settings.enough if self.settings.when_empty == "wait" else 0.0
+        wanted = min(asked, max(1, math.ceil(share * asked - 1e-9)))
+        return wanted - judged - stuck
+
+    def _tell(self, left: int) -> None:
+        assert self._site is not None
+        text = f"waiting for answers to {left} more question{'s' * (left != 1)} at {self._site.address}"
+        self.console.print(text, soft_wrap=True, markup=False)
+
+    def _file_checks(self, store: Store[C], rng: np.random.Generator) -> None:
+        """Choose check questions among the candidates of what was asked since, as many as will be given."""
+        asked = store.open_queries(self.name)
+        count = math.ceil(self.settings.check_share * len(asked))
+        if not count or store.counts()["asked"] == self._checked:
+            return
+        self._checked = store.counts()["asked"]
+        chosen = pick_checks(store, asked, count, rng)
+        if chosen.queries:
+            cast(Any, store).ask(chosen.queries, purpose="check", expected=chosen.expected)
