@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint types layers unit slow docs peers clean
+.PHONY: demo test lint types layers unit slow browser docs peers clean
 
 demo: .venv/demo
 	$(BIN)/prefrl run control/pendulum --out runs/pendulum
@@ -13,7 +13,7 @@ demo: .venv/demo
 	@echo "  runs/pendulum/report.html"
 	@echo "  runs/reviews/report.html"
 
-test: lint types layers unit slow docs
+test: lint types layers unit slow browser docs
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -30,6 +30,9 @@ unit: .venv/dev
 
 slow: .venv/dev
 	$(BIN)/python -m pytest -m slow
+
+browser: .venv/dev
+	$(BIN)/python -m pytest -m browser
 
 docs: .venv/dev
 	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from prefrl import cli_store
+from prefrl import cli_data, cli_store
+from prefrl.cli_data import Labelers, Out, Split
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
     from prefrl.config import Config
@@ -23,25 +23,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+app.add_typer(cli_data.commands)
 app.add_typer(cli_store.commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
-Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
-Labelers = Annotated[str, typer.Option(help="Only judgements by these, separated by commas; default: everybody's.")]
-Split = Annotated[str, typer.Option(help="Only this part of a file, train or eval say; default: all of it.")]
 
 
 FEW = 20
 """With fewer held-out comparisons than this an accuracy is mostly luck."""
-
-
-class Form(StrEnum):
-    """What is written to files, and how."""
-
-    preferences = "preferences"
-    bundle = "bundle"
-    classifier = "classifier"
 
 
 @app.command()
@@ -194,50 +184,6 @@ def report(folder: Folder) -> None:
     from prefrl.evaluate.report import write_report
 
     say(f"report: {write_report(folder)}")
-
-
-@app.command("export")
-def export_(
-    store: Annotated[Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`.", exists=True)],
-    to: Annotated[Path, typer.Option(help="A .jsonl file for preferences, else a folder.")],
-    form: Annotated[
-        Form, typer.Option(help="prompt/chosen/rejected lines; all there is; a reward model for transformers.")
-    ] = Form.preferences,
-) -> None:
-    """Write judgements, or a reward model of text, to files."""
-    from prefrl.console import say
-
-    if form is Form.classifier:
-        from prefrl.stages import export_classifier
-
-        say(f"{to}: its logit, shifted by {export_classifier(store, to):+.6g}, is the mean of the reward's members")
-        return
-    from prefrl.label.exchange import export_bundle, export_preferences
-    from prefrl.store import Store
-
-    with Store[Any](store, write=False) as opened:
-        done = (export_preferences if form is Form.preferences else export_bundle)(opened, to)
-    say(f"{done.written} written to {to}" + (f", {done.ties} ties left out" if done.ties else ""))
-
-
-@app.command("import")
-def import_(
-    path: Annotated[Path, typer.Argument(help="A file of judgements, or a bundle.", exists=True)],
-    labelers: Labelers = "",
-    split: Split = "",
-    out: Out = Path("labels"),
-) -> None:
-    """Read judgements from files into a store, all or none."""
-    from prefrl.console import say
-    from prefrl.label.exchange import import_judgements
-    from prefrl.label.formats import Which
-    from prefrl.store import Store
-
-    with Store[Any](out) as store:
-        done = import_judgements(path, store, Which.of(labelers, split))
-    for note in done.notes:
-        say(note, "yellow")
-    say(f"{done.read} judgements read into {out}")
 
 
 @app.command()

@@ -83,6 +83,8 @@ EXTRAS = {
     "fastapi": "label",
     "starlette": "label",
     "uvicorn": "label",
+    "pyarrow": "interchange",
+    "minari": "interchange",
 }
 
 

@@ -274,7 +274,7 @@ def _set_head(connection: Connection, seq: int, hash: str) -> None:
 
 
 def _says_full(error: BaseException | None) -> bool:
-    """Whether an error, or one that it hides, is that of a full disk: SQLite then drops savepoints, and says so last."""
+    """Whether an error, or one that it hides, is that of a full disk: SQLite then misses its savepoints too."""
     words = ("disk is full", "no space left", "could not extend")
     return error is not None and (any(w in str(error).lower() for w in words) or _says_full(error.__context__))
 

@@ -1,31 +1,64 @@
-"""Files of judgements, read whole or not at all: judged responses to prompts, and judged pairs of segments."""
+"""Files of judgements, read whole or not at all: judged responses to prompts, and judged pairs of segments.
+
+A file is read twice: once to find every mistake, and once for its judgements, so that none of it need be kept.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from prefrl.types import Judged
+from prefrl.label.reading import TABLES, list_files
+from prefrl.types import Answer, Judged, Query, Skip
 
 SHOWN_ERRORS = 20
+SHOWN_REPEATS = 5
 HUMAN, SCRIPT = "human", "script"
 
 
 class Row(NamedTuple):
-    """One judgement of a file."""
+    """One answer of a file."""
 
-    judged: Judged[Any]
+    query: Query[Any]
+    answer: Answer
     """Its labeler is "" where the file names none."""
-    split: str
+    split: str = ""
     """The part of the data that the file puts it into; "" where it says nothing."""
+
+    @property
+    def judged(self) -> Judged[Any]:
+        """The judgement; for rows that are no skip."""
+        if isinstance(self.answer, Skip):
+            raise ValueError("a skip is no judgement")
+        return Judged(self.query, self.answer)
 
 
 Parts: TypeAlias = Iterable[tuple[str, Callable[[], Sequence[Row | str]]]]
-"""(place, parse): where a part of a file stands, and what reads it: judgements, and reasons for leaving some out."""
+"""(place, parse): where a part of a file stands, and what reads it: answers, and reasons for leaving some out."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the rows of a file are to be read."""
+
+    form: str = "auto"
+    """Which of `text_rows.FORMS` they have; "auto" looks at each row's columns."""
+    columns: tuple[tuple[str, str], ...] = ()
+    """(ours, the file's): which of its columns are to be read as what; when given, nothing else is read."""
+    skip_bad: bool = False
+    """Leave bad rows out, and tell of them, instead of refusing the file."""
+
+    @classmethod
+    def of(cls, form: str = "auto", columns: str = "", skip_bad: bool = False) -> Layout:
+        """From names as `prompt=question,chosen=better,rejected=worse`."""
+        pairs = [pair.partition("=") for pair in columns.split(",") if pair.strip()]
+        if bad := ["".join(pair) for pair in pairs if not (pair[0].strip() and pair[2].strip())]:
+            raise ValueError(f"expected columns as prompt=question,chosen=better, got {bad[0]!r}")
+        return cls(form, tuple((ours.strip(), theirs.strip()) for ours, _, theirs in pairs), skip_bad)
 
 
 @dataclass(frozen=True)
@@ -56,7 +89,7 @@ class Read:
     """What was left out, for people."""
 
 
-def read_judgements(path: Path, which: Which | None = None) -> Read:
+def read_judgements(path: Path, which: Which | None = None, layout: Layout | None = None) -> Read:
     """The judgements in a file of JSON lines (.gz or not), in a table (.csv, .parquet) or in an .npz of segment pairs.
 
     All or none: raises `ValueError` with the place of each mistake (the first 20), also in parts that `which` leaves
@@ -64,80 +97,150 @@ def read_judgements(path: Path, which: Which | None = None) -> Read:
     file names no labeler it is called after the content, so that reading it twice changes nothing. Labels of a
     "script" beside a human's are left out, and said to be, unless `which` asks for them.
     """
-    rows, left_out = _parse(path)
-    if not rows:
-        reasons = "".join(f"; {note}" for note in _told(left_out))
-        raise ValueError(f"{path}: expected at least one row with a judgement, got none{reasons}")
-    which, named = which or Which(), _numbered(rows, f"file:{_digest(path)}")
-    labelers = {_name(row) for row in named}
+    checked = check_file(path, which, layout)
+    return Read(tuple(row.judged for row in checked.rows() if not isinstance(row.answer, Skip)), checked.notes)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A file, or a folder of files, that was read through, and found whole."""
+
+    path: Path
+    which: Which
+    layout: Layout
+    default: str
+    """Whom its judgements are by where it names nobody."""
+    notes: tuple[str, ...]
+
+    def rows(self) -> Iterator[Row]:
+        """The answers that count, each with a labeler; read from the file again."""
+        seen: Counter[bytes] = Counter()
+        for _, parse in _parts(self.path, self.layout):
+            try:
+                found = parse()
+            except ValueError:
+                if not self.layout.skip_bad:
+                    raise
+                continue
+            for row in (_numbered(one, self.default, seen) for one in found if isinstance(one, Row)):
+                if self.which.takes(row.answer.labeler) and self.which.split in ("", row.split):
+                    yield row
+
+
+def check_file(path: Path, which: Which | None = None, layout: Layout | None = None) -> Checked:
+    """Read through a file, or a folder of files, keeping none of it; raises as `read_judgements` does."""
+    layout, which, found = layout or Layout(), which or Which(), _Found(f"file:{_digest(path)}")
+    for place, parse in _parts(path, layout):
+        try:
+            parsed = parse()
+        except ValueError as error:
+            found.mistake(f"{place}: {error}")
+        else:
+            found.take(place, parsed)
+    notes = found.told(path, layout.skip_bad)
+    labelers = {who.partition("#")[0] for who, _ in found.counts}
     if not which.labelers and {HUMAN, SCRIPT} <= labelers:
         which = replace(which, labelers=tuple(labelers - {SCRIPT}))
-        left_out["label by a script (--labelers script reads it)"] = sum(
-            _name(row) == SCRIPT and which.split in ("", row.split) for row in named
+        scripted = sum(
+            n
+            for (who, split), n in found.counts.items()
+            if who.partition("#")[0] == SCRIPT and which.split in ("", split)
         )
-    chosen = [row.judged for row in named if which.takes(_name(row)) and which.split in ("", row.split)]
-    if not chosen:
-        raise ValueError(f"{path}: {_nothing(named, which)}")
-    return Read(tuple(chosen), _told(left_out))
+        notes += _told(Counter({"label by a script (--labelers script reads it)": scripted}))
+    if not any(which.takes(who) and which.split in ("", split) for who, split in found.counts):
+        raise ValueError(f"{path}: {_nothing(found.counts, which)}")
+    return Checked(path, which, layout, found.default, notes)
 
 
-def _parse(path: Path) -> tuple[list[Row], Counter[str]]:
-    """Every row of a file, and how many were left out for which reason."""
-    rows: list[Row] = []
-    left_out: Counter[str] = Counter()
-    errors = []
-    for place, parse in _parts(path):
-        try:
-            found = parse()
-        except ValueError as error:
-            errors.append(f"{place}: {error}")
-        else:
-            rows += [one for one in found if isinstance(one, Row)]
-            left_out.update(one for one in found if isinstance(one, str))
-    if errors:
-        more = f"\n... and {len(errors) - SHOWN_ERRORS} more" if len(errors) > SHOWN_ERRORS else ""
-        raise ValueError(f"{path}: nothing was read\n" + "\n".join(errors[:SHOWN_ERRORS]) + more)
-    return rows, left_out
+@dataclass
+class _Found:
+    """What a first reading of a file comes to: counts, and a few bytes for each row."""
+
+    default: str
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """(labeler, split) -> answers."""
+    left_out: Counter[str] = field(default_factory=Counter)
+    errors: list[str] = field(default_factory=list)
+    mistakes: int = 0
+    seen: Counter[bytes] = field(default_factory=Counter)
+    first: dict[bytes, str] = field(default_factory=dict)
+    """Where a labeler first judged a query."""
+    repeats: list[str] = field(default_factory=list)
+    repeated: int = 0
+
+    def mistake(self, error: str) -> None:
+        self.mistakes += 1
+        self.errors += [error] * (len(self.errors) < SHOWN_ERRORS)
+
+    def take(self, place: str, parsed: Sequence[Row | str]) -> None:
+        self.left_out.update(one for one in parsed if isinstance(one, str))
+        for row in (one for one in parsed if isinstance(one, Row)):
+            self.counts[row.answer.labeler or self.default, row.split] += 1
+            key = _key(row, self.default)
+            self.seen[key] += 1
+            if self.seen[key] > 1:
+                self.repeated += 1
+                self.repeats += [f"{place} repeats {self.first[key]}"] * (len(self.repeats) < SHOWN_REPEATS)
+            self.first.setdefault(key, place)
+
+    def told(self, path: Path, skip_bad: bool) -> tuple[str, ...]:
+        """Notes for people. Raises `ValueError` for mistakes that may not be left out, and where nothing was found."""
+        more = f"\n... and {self.mistakes - SHOWN_ERRORS} more" if self.mistakes > SHOWN_ERRORS else ""
+        listed = "\n".join(self.errors) + more
+        if self.mistakes and not skip_bad:
+            raise ValueError(f"{path}: nothing was read\n{listed}")
+        notes = _told(self.left_out)
+        if self.mistakes:
+            notes += (f"left out: {self.mistakes} x bad row\n{listed}",)
+        if self.repeated:
+            shown = "; ".join(self.repeats) + ("; ..." if self.repeated > SHOWN_REPEATS else "")
+            again = "another judgement of the same query by the same labeler, kept as NAME#2"
+            notes += (f"{self.repeated} x {again}: {shown}",)
+        if not self.counts:
+            reasons = "".join(f"; {note}" for note in notes)
+            raise ValueError(f"{path}: expected at least one row with a judgement, got none{reasons}")
+        return notes
 
 
-def _parts(path: Path) -> Parts:
+def _parts(path: Path, layout: Layout) -> Parts:
     if path.suffix == ".npz":
         from prefrl.label.segment_pairs import segment_pairs
 
         return segment_pairs(path)
+    if path.is_dir():
+        from prefrl.label.dataset_folders import folder_rows
+        from prefrl.label.minari_folders import is_minari, minari_rows
+
+        return minari_rows(path) if is_minari(path) else folder_rows(path, layout)
     from prefrl.label.text_rows import text_rows
 
-    return text_rows(path)
+    return text_rows(path, layout)
 
 
 def _digest(path: Path) -> str:
+    if path.is_dir():
+        files = list_files(path, [f"*{suffix}*" for suffix in (*TABLES, ".json")])
+        return hashlib.sha256("".join(_digest(file) for file in files).encode()).hexdigest()[:12]
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:12]
 
 
-def _numbered(rows: Sequence[Row], default: str) -> list[Row]:
-    """Every judgement with a labeler; one's second judgement of a query is by "NAME#2": a store keeps one a name."""
-    seen: Counter[tuple[str, str]] = Counter()
-    found = []
-    for row in rows:
-        query, judgement = row.judged.query, row.judged.judgement
-        who = judgement.labeler or default
-        seen[query.id, who] += 1
-        name = f"{who}#{again}" if (again := seen[query.id, who]) > 1 else who
-        found.append(row._replace(judged=Judged(query, replace(judgement, labeler=name))))
-    return found
+def _key(row: Row, default: str) -> bytes:
+    return hashlib.sha256(f"{row.query.id}:{row.answer.labeler or default}".encode("utf-8", "surrogatepass")).digest()
 
 
-def _name(row: Row) -> str:
-    """The labeler, whichever of its judgements this is."""
-    return row.judged.judgement.labeler.partition("#")[0]
+def _numbered(row: Row, default: str, seen: Counter[bytes]) -> Row:
+    """A row with a labeler; one's second judgement of a query is by "NAME#2": a store keeps one a name."""
+    key, who = _key(row, default), row.answer.labeler or default
+    seen[key] += 1
+    return row._replace(answer=replace(row.answer, labeler=f"{who}#{seen[key]}" if seen[key] > 1 else who))
 
 
-def _nothing(rows: Sequence[Row], which: Which) -> str:
+def _nothing(counts: Iterable[tuple[str, str]], which: Which) -> str:
     """Why nothing was chosen, and what there is to choose from."""
     wanted = " and ".join([*which.labelers, *([f"split {which.split!r}"] if which.split else [])])
-    labelers = ", ".join(sorted({_name(row) for row in rows}))
-    splits = ", ".join(sorted({row.split for row in rows} - {""})) or "none"
+    labelers = ", ".join(sorted({who.partition("#")[0] for who, _ in counts}))
+    splits = ", ".join(sorted({split for _, split in counts} - {""})) or "none"
     return f"no judgement by or in {wanted}; labelers there: {labelers}; splits there: {splits}"
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from prefrl.label.formats import Parts, Row
-from prefrl.types import Comparison, Judged, Query, Segment
+from prefrl.types import Comparison, Query, Segment
 
 ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
 
@@ -74,7 +74,7 @@ def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], sp
         value = float(values[i])
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"label_{labeler}: expected 0 (first better) to 1 (second better), got {value}")
-        rows.append(Row(Judged(query, Comparison(query.id, value if swapped else 1.0 - value, labeler)), split))
+        rows.append(Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split))
     return rows
 
 

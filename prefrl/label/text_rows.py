@@ -1,166 +1,198 @@
 """Judged responses to prompts: JSON lines in the forms that the field uses, and tables of chosen and rejected.
 
-- `{"prompt", "chosen", "rejected"}`;
-- `{"prompt", "responses": [...]}` with one of `"ranks"`, `"best"`, `"ratings"` (and `"scale"`), `"preference"`;
-- conversation trees of OpenAssistant (Koepf et al. 2023): a ranking of the replies to each of a person's turns.
+- `{"prompt", "chosen", "rejected"}` as text, or as lists of `{"role", "content"}`; without a prompt where chosen and
+  rejected are whole conversations. `"margin"` or `"preference"` says how much better;
+- `{"prompt", "completion", "label"}`: one response, good or not;
+- `{"prompt", "responses": [...]}` with one of `"ranks"`, `"best"`, `"ratings"` (and `"scale"`), `"preference"` or
+  `"skip"`;
+- conversation trees of OpenAssistant (Koepf et al. 2023): a ranking of the replies to each of a person's turns;
+- what labelling tools write: see `tool_rows`.
 
-`"labeler"`, `"weight"` and `"split"` may be added to a row of the first two forms.
+`"labeler"`, `"weight"`, `"shown"` and `"split"` may be added to a row of the first three forms.
 """
 
 from __future__ import annotations
 
-import json
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefrl.files import read_lines
-from prefrl.label.formats import Parts, Row
-from prefrl.types import Choice, Comparison, Judged, Judgement, Query, Ranking, Rating, Response
+from prefrl.label.formats import Layout, Parts, Row
+from prefrl.label.reading import Line, parse_json, read_rows
+from prefrl.label.row_answers import VERDICTS, answer_of, answered, comparison, number, optional, responses
+from prefrl.label.tables import unguarded
+from prefrl.label.transcripts import (
+    CUE,
+    SPEAKERS,
+    parse_transcript,
+    prompt_text,
+    read_messages,
+    response_text,
+    split_conversations,
+)
+from prefrl.types import Rating
 
-PAIR = ("prompt", "chosen", "rejected")
-VERDICTS = ("ranks", "best", "ratings", "preference")
-SPEAKERS = {"prompter": "Human", "assistant": "Assistant"}
+COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "label", "responses", *VERDICTS, "scale")
+_NO_TEXT = ("margin", "label", "responses", *VERDICTS, "scale", "weight", "shown")
+EXTRA = ("labeler", "weight", "shown", "split", "left", "right")
+TREE_ROLES = ("prompter", "assistant")
 
 
-def text_rows(path: Path) -> Parts:
-    """(row N, what reads it) for each line or table row."""
-    for number, row in enumerate(_rows(path), 1):
-        yield f"row {number}", partial(parse, row)
+def text_rows(path: Path, layout: Layout | None = None) -> Parts:
+    """(row N, what reads it) for each line, table row or element of a list."""
+    layout = layout or Layout()
+    if unknown := {ours for ours, _ in layout.columns} - {*COLUMNS, *EXTRA}:
+        raise ValueError(f"no column {min(unknown)!r} is read; there are: {', '.join((*COLUMNS, *EXTRA))}")
+    cells = ".csv" in (suffix.lower() for suffix in path.suffixes)
+    for count, row in enumerate(read_rows(path), 1):
+        yield f"row {count}", partial(parse, row, layout, cells)
 
 
-def parse(row: Any) -> list[Row | str]:
-    """A line, or a table's row as a dict, as judgements and reasons for leaving others out; raises `ValueError`."""
-    if isinstance(row, str):
-        row = _json(row)
+def parse(row: Any, layout: Layout | None = None, cells: bool = False) -> list[Row | str]:
+    """A line, or a table's row as a dict, as answers and reasons for leaving others out; raises `ValueError`.
+
+    With `cells` the values are all text, as in a .csv.
+    """
+    layout = layout or Layout()
+    if isinstance(row, Line):
+        row = parse_json(row.text)
     if not isinstance(row, dict):
         raise ValueError(f"expected an object, got {type(row).__name__}")
-    if isinstance(row.get("prompt"), dict):
-        return _tree(row["prompt"], _optional(row, "split", str, ""))
-    return [Row(_several(row) if "responses" in row else _pair(row), _optional(row, "split", str, ""))]
+    row = _mapped(unguarded(row) if cells else row, dict(layout.columns))
+    row = {name: _typed(name, value) for name, value in row.items()} if cells else row
+    return FORMS[form_of(row) if layout.form == "auto" else layout.form](row)
 
 
-def _rows(path: Path) -> Iterator[Any]:
-    """Lines of JSON, or the rows of a table as dicts."""
-    if path.suffix not in (".csv", ".parquet"):
-        yield from read_lines(path)
-        return
-    from datasets import Dataset
+def form_of(row: Mapping[str, Any]) -> str:
+    """Which form a row has, by its columns; "preferences" where nothing else is meant."""
+    if isinstance(row.get("fields"), Mapping):
+        return "argilla"
+    if isinstance(row.get("data"), Mapping) and "annotations" in row:
+        return "label-studio"
+    if "conversation_a" in row:
+        return "arena"
+    if isinstance(row.get("prompt"), Mapping):
+        return "tree"
+    if row.get("responses") is not None:
+        return "responses"
+    return "unpaired" if "completion" in row and "chosen" not in row else "preferences"
 
-    with tempfile.TemporaryDirectory() as cache:
-        read = Dataset.from_csv if path.suffix == ".csv" else Dataset.from_parquet
-        yield from read(str(path), cache_dir=cache, keep_in_memory=True)
+
+def _mapped(row: dict[str, Any], columns: Mapping[str, str]) -> dict[str, Any]:
+    """The row under our names, with what was named alone; a tool's row keeps its other parts."""
+    if not columns:
+        return row
+    inner = next((name for name in ("fields", "data") if isinstance(row.get(name), Mapping)), "")
+    given = row[inner] if inner else row
+    for ours, theirs in columns.items():
+        if theirs not in given:
+            raise ValueError(f"column {theirs!r}, for {ours!r}, is missing; there are: {', '.join(map(str, given))}")
+    found = {ours: given[theirs] for ours, theirs in columns.items()}
+    return row | {inner: found} if inner else found
 
 
-def _json(line: str) -> Any:
+def _typed(name: str, cell: str | None) -> Any:
+    """What the text of a cell stands for, where its column holds no text."""
+    if cell is None or name == "skip" or name not in _NO_TEXT:
+        return cell
     try:
-        return json.loads(line, parse_constant=_no_constant)
-    except RecursionError:
-        raise ValueError("the object is nested too deeply") from None
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a value")
+        return parse_json(cell.lower() if name == "label" else cell)
+    except ValueError:
+        return cell
 
 
 # --- chosen and rejected -----------------------------------------------------------------------------------------
 
 
-def _pair(row: Mapping[str, Any]) -> Judged[Response]:
-    for name in PAIR:
+def _pair(row: Mapping[str, Any]) -> list[Row | str]:
+    prompt, chosen, rejected = _conversational(row) or _implicit(row) or _plain(row)
+    if chosen == rejected:
+        raise ValueError("chosen and rejected are the same text")
+    return [answered(row, responses(prompt, [chosen, rejected]), partial(comparison, _strength(row)))]
+
+
+def _plain(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    for name in ("prompt", "chosen", "rejected"):
         if name not in row:
             raise ValueError(f"column {name!r} is missing; there are: {', '.join(map(str, row))}")
         if not isinstance(row[name], str):
-            raise ValueError(f"column {name!r}: expected a string, got {row[name]!r}")
-    if row["chosen"] == row["rejected"]:
-        raise ValueError("chosen and rejected are the same text")
-    return _judged(row, [row["chosen"], row["rejected"]], partial(_comparison, 1.0))
+            raise ValueError(f"column {name!r}: expected a string, got {row[name]!r:.200}")
+    return row["prompt"], row["chosen"], row["rejected"]
+
+
+def _conversational(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
+    """Chosen and rejected as lists of messages: responses, or whole conversations that start alike."""
+    if not isinstance(row.get("chosen"), list) or not isinstance(row.get("rejected"), list):
+        return None
+    chosen, rejected = read_messages(row["chosen"]), read_messages(row["rejected"])
+    if row.get("prompt") is None or chosen[0]["role"] != "assistant":
+        return split_conversations(chosen, rejected)
+    return _prompt(row["prompt"]), response_text(chosen), response_text(rejected)
+
+
+def _implicit(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
+    """Chosen and rejected as transcripts that start alike."""
+    if row.get("prompt") is not None or not (
+        isinstance(row.get("chosen"), str) and isinstance(row.get("rejected"), str)
+    ):
+        return None
+    chosen, rejected = parse_transcript(row["chosen"]), parse_transcript(row["rejected"])
+    if chosen is None or rejected is None:
+        return None
+    return split_conversations(chosen, rejected)
+
+
+def _prompt(value: Any) -> str:
+    return prompt_text(read_messages(value)) if isinstance(value, list) else str(value)
+
+
+def _strength(row: Mapping[str, Any]) -> float:
+    """How probably the chosen one is better: as said, or by its margin in the Bradley-Terry model, else surely."""
+    preference, margin = number(row, "preference", 1.0), number(row, "margin", 0.0)
+    if not 0.0 <= preference <= 1.0:
+        raise ValueError(f"a preference must lie in [0, 1], got {preference}")
+    if margin < 0.0:
+        raise ValueError(f"column 'margin': expected a number from 0 on, got {margin}: is the rejected one better?")
+    if margin == 0.0 or row.get("preference") is not None:
+        return preference
+    return round(1.0 / (1.0 + math.exp(-margin)), 12)
+
+
+def _unpaired(row: Mapping[str, Any]) -> list[Row | str]:
+    """One response that is good or not: a rating on a scale of two levels."""
+    label, completion = row.get("label"), row.get("completion")
+    if label not in (0, 1) or not isinstance(label, bool | int):
+        raise ValueError(f"column 'label': expected true or false, got {label!r:.200}")
+    if isinstance(completion, list):
+        completion = response_text(read_messages(completion))
+    if not isinstance(completion, str) or not isinstance(row.get("prompt"), str | list):
+        raise ValueError(f'expected "prompt" and "completion" as text or messages, got {row!r:.200}')
+    return [answered(row, responses(_prompt(row["prompt"]), [completion]), partial(_good, int(label)))]
+
+
+def _good(level: int, query: str, order: Sequence[int], who: dict[str, Any]) -> Rating:
+    return Rating(query, (level,), 2, **who)
 
 
 # --- several responses ------------------------------------------------------------------------------------------
 
 
-def _several(row: Mapping[str, Any]) -> Judged[Response]:
-    texts, given = row["responses"], [name for name in VERDICTS if row.get(name) is not None]
+def _several(row: Mapping[str, Any]) -> Row:
+    texts = row["responses"]
     if not isinstance(row.get("prompt"), str) or not isinstance(texts, list):
         raise ValueError(f'expected "prompt": string and "responses": list, got {row!r:.200}')
     if not all(isinstance(text, str) for text in texts):
         raise ValueError(f"expected responses that are strings, got {texts!r:.200}")
-    if len(given) != 1:
-        raise ValueError(f"expected one of {', '.join(VERDICTS)}, got {', '.join(given) or 'none'}")
-    return _judged(row, texts, partial(_VERDICTS[given[0]], row))
-
-
-def _judged(row: Mapping[str, Any], texts: Sequence[str], verdict: Callable[..., Judgement]) -> Judged[Response]:
-    """A query over responses, and a judgement in the query's own order: `order[i]` is where response i stands in it."""
-    responses = [Response(row["prompt"], text) for text in texts]
-    query = Query(tuple(responses))
-    place = {candidate.id: i for i, candidate in enumerate(query.candidates)}
-    who = {"labeler": _optional(row, "labeler", str, ""), "weight": float(_optional(row, "weight", (int, float), 1.0))}
-    return Judged(query, verdict(query=query.id, order=[place[r.id] for r in responses], who=who))
-
-
-def _comparison(first_better: float, query: str, order: Sequence[int], who: dict[str, Any]) -> Comparison:
-    return Comparison(query, first_better if order[0] == 0 else 1.0 - first_better, **who)
-
-
-def _preference(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Comparison:
-    value = row["preference"]
-    if len(order) != 2 or isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"a preference is a number, of the first of two responses; got {value!r} for {len(order)}")
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"a preference must lie in [0, 1], got {value}")
-    return _comparison(float(value), query, order, who)
-
-
-def _ranking(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Ranking:
-    return Ranking(query, _integers(row["ranks"], "ranks", order), **who)
-
-
-def _choice(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Choice:
-    best = row["best"]
-    if isinstance(best, bool) or not isinstance(best, int) or not 0 <= best < len(order):
-        raise ValueError(f"best: expected the number of a response, from 0 to {len(order) - 1}, got {best!r}")
-    return Choice(query, order[best], **who)
-
-
-def _rating(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Rating:
-    scale = row.get("scale")
-    if isinstance(scale, bool) or not isinstance(scale, int):
-        raise ValueError(f'ratings need "scale", how many levels there are; got {scale!r}')
-    return Rating(query, _integers(row["ratings"], "ratings", order), scale, **who)
-
-
-_VERDICTS: Mapping[str, Callable[..., Judgement]] = {
-    "ranks": _ranking,
-    "best": _choice,
-    "ratings": _rating,
-    "preference": _preference,
-}
-
-
-def _integers(values: Any, name: str, order: Sequence[int]) -> tuple[int, ...]:
-    """One integer for each response, put into the query's order."""
-    whole = isinstance(values, list) and all(isinstance(v, int) and not isinstance(v, bool) for v in values)
-    if not whole or len(values) != len(order):
-        raise ValueError(f"{name}: expected an integer for each of {len(order)} responses, got {values!r:.200}")
-    by_place = dict(zip(order, values, strict=True))
-    return tuple(by_place[i] for i in range(len(order)))
-
-
-def _optional(row: Mapping[str, Any], name: str, kind: Any, default: Any) -> Any:
-    """A value that may be left out; a table has None there."""
-    value = row.get(name)
-    if value is None:
-        return default
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise ValueError(f"column {name!r}: expected {getattr(kind, '__name__', 'number')}, got {value!r:.200}")
-    return value
+    return answer_of(row, responses(row["prompt"], texts))
 
 
 # --- conversation trees ------------------------------------------------------------------------------------------
+
+
+def _trees(row: Mapping[str, Any]) -> list[Row | str]:
+    return _tree(row["prompt"], optional(row, "split", str, ""))
 
 
 def _tree(root: Mapping[str, Any], split: str) -> list[Row | str]:
@@ -169,12 +201,14 @@ def _tree(root: Mapping[str, Any], split: str) -> list[Row | str]:
     waiting = [(root, "")]
     while waiting:
         message, before = waiting.pop()
-        if message.get("role") not in SPEAKERS or not isinstance(message.get("text"), str):
-            raise ValueError(f"expected a message with a text and a role ({', '.join(SPEAKERS)}), got {message!r:.200}")
+        if message.get("role") not in TREE_ROLES or not isinstance(message.get("text"), str):
+            raise ValueError(
+                f"expected a message with a text and a role ({', '.join(TREE_ROLES)}), got {message!r:.200}"
+            )
         here = f"{before}{SPEAKERS[message['role']]}: {message['text']}\n\n"
         replies = [r for r in message.get("replies") or [] if isinstance(r, dict)]
         if message["role"] == "prompter" and replies:
-            found += _group(f"{here}{SPEAKERS['assistant']}: ", replies, split)
+            found += _group(here + CUE, replies, split)
         waiting += [(reply, here) for reply in reversed(replies)]
     return found
 
@@ -184,4 +218,29 @@ def _group(prompt: str, replies: Sequence[Mapping[str, Any]], split: str) -> lis
     if len(ranked) < 2:
         return ["prompt with fewer than two ranked replies"]
     row = {"prompt": prompt, "responses": [r.get("text") for r in ranked], "ranks": [r["rank"] for r in ranked]}
-    return [Row(_several(row), split), *["reply without a rank beside ranked ones"] * (len(replies) - len(ranked))]
+    return [
+        _several(row)._replace(split=split),
+        *["reply without a rank beside ranked ones"] * (len(replies) - len(ranked)),
+    ]
+
+
+def _responses(row: Mapping[str, Any]) -> list[Row | str]:
+    return [_several(row)]
+
+
+def _of_tool(name: str, row: Mapping[str, Any]) -> list[Row | str]:
+    from prefrl.label.tool_rows import TOOLS
+
+    return TOOLS[name](row)
+
+
+FORMS: Mapping[str, Callable[[Mapping[str, Any]], list[Row | str]]] = {
+    "preferences": _pair,
+    "unpaired": _unpaired,
+    "responses": _responses,
+    "tree": _trees,
+    "argilla": partial(_of_tool, "argilla"),
+    "label-studio": partial(_of_tool, "label-studio"),
+    "arena": partial(_of_tool, "arena"),
+}
+"""What reads the rows of each form."""

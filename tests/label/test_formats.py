@@ -132,7 +132,7 @@ def test_a_compressed_file_reads_as_a_plain_one_and_a_damaged_one_is_refused(
         (RANKED | {"ranks": [0, -1, 1]}, "a rank >= 0"),
         (RANKED | {"responses": ["a"], "ranks": [0]}, "at least 2 candidates"),
         (RANKED | {"responses": ["a", "a", "b"]}, "may not compare a candidate with itself"),
-        (RANKED | {"best": 0}, "expected one of ranks, best, ratings, preference, got ranks, best"),
+        (RANKED | {"best": 0}, "expected one of ranks, best, ratings, preference, skip, got ranks, best"),
         ({"prompt": "p", "responses": ["a", "b"]}, "got none"),
         ({"prompt": "p", "responses": ["a", 3], "best": 0}, "expected responses that are strings"),
         ({"responses": ["a", "b"], "best": 0}, 'expected "prompt": string'),

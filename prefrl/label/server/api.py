@@ -269,6 +269,8 @@ class AnnotatorRow(Plain):
     too_fast: int
     """Answers in less than half a clip's length."""
     last_seen: str | None
+    concerns: list[str] = []
+    """What an admin should look at, in words: one side always, checks missed, answers too fast."""
 
 
 class AgreementRow(Plain):

@@ -114,16 +114,15 @@ class Dashboard:
             person = tallies.person({name: rows[name][own] for name in rows}, stands[own], alive[own])
             repeats = share(*same.get(number, (0, 0)), "no question was repeated")
             others = {"repeats": repeats, "agreement": each.get(number, ALONE)}
-            found.append(
-                AnnotatorRow(
-                    name=one.name,
-                    role=one.role,
-                    state=one.state,
-                    last_seen=self._seen.get(one.name),
-                    **asdict(person),
-                    **{name: interval(measured) for name, measured in others.items()},
-                )
+            made = AnnotatorRow(
+                name=one.name,
+                role=one.role,
+                state=one.state,
+                last_seen=self._seen.get(one.name),
+                **asdict(person),
+                **{name: interval(measured) for name, measured in others.items()},
             )
+            found.append(made.model_copy(update={"concerns": tallies.concerns(made)}))
         return found
 
 

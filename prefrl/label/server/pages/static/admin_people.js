@@ -89,7 +89,7 @@ function nobody() {
   return el("tr", {}, el("td", { class: "empty", colspan: String(COLUMNS.length + 1), text: t("people.nobody") }));
 }
 
-function who({ name, role, state }) {
+function who({ name, role, state, concerns }) {
   const states = { active: t("people.active"), paused: t("people.paused"), revoked: t("people.revoked") };
   return el(
     "span",
@@ -97,6 +97,7 @@ function who({ name, role, state }) {
     el("b", {}, isolate(name)),
     el("span", { class: "role", text: role }),
     el("span", { class: `state ${state}`, text: states[state] }),
+    concerns.map((text) => el("span", { class: "concern", testid: "concern", text })),
   );
 }
 

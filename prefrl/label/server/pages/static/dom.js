@@ -103,7 +103,7 @@ export function openDialog(title, body, { testid, wide = false, actions = [] } =
     "dialog",
     { class: wide ? "dialog wide" : "dialog", testid, "aria-labelledby": "dialog-title" },
     el("header", { class: "dialog-head" }, heading, shut),
-    el("div", { class: "dialog-body" }, body),
+    el("div", { class: "dialog-body", tabindex: "0" }, body),
     actions.length ? el("footer", { class: "dialog-foot" }, actions) : null,
   );
   dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
