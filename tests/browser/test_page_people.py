@@ -112,7 +112,7 @@ def test_an_export_is_downloaded(text_house: House, visit: Visit) -> None:
     ann.press("1")
     ann.saved()
     with me.page.expect_download() as download:
-        me.test("export-jsonl").click()
+        me.test("export-preferences").click()
     assert len(download.value.path().read_text().splitlines()) == 1
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -43,8 +42,9 @@ def _add_overview(router: APIRouter) -> None:
     @router.get("/api/admin/export/{name}", responses=errors(401, 404), response_class=FileResponse)
     async def export(name: str, who: Admin, served: Served) -> FileResponse:
         """Judgements as a file."""
-        if name not in EXPORTS:
-            raise Refused(404, f"there is no such export: choose from {', '.join(EXPORTS)}")
+        known = EXPORTS[served.terms.page.kind]
+        if name not in known:
+            raise Refused(404, f"there is no such export: choose from {', '.join(known)}")
         path = await run_in_threadpool(_export, served, name)
         done = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
         return FileResponse(path, filename=path.name, background=done)
@@ -134,35 +134,37 @@ def _overview(served: Service) -> api.Overview:
         overlap=overlap,
         guideline=served.guideline,
         health=health,
-        exports=list(EXPORTS),
+        exports=list(EXPORTS[served.terms.page.kind]),
         **vars(figures),
     )
 
 
 def _export(served: Service, name: str) -> Path:
-    """Write an export into a temporary folder of its own, from a store that is only read."""
+    """Write an export into a temporary folder of its own, from a store that is only read; folders are zipped."""
+    from prefrl.label.exchange import export
+
     folder = Path(tempfile.mkdtemp(prefix="prefrl-export-"))
+    path = folder / f"{name}{EXPORTS[served.terms.page.kind][name]}"
     try:
         with Store[Any](served.store.folder, write=False) as store:
-            return EXPORTS[name](store, folder)
+            export(store, path, name)
+        return Path(shutil.make_archive(str(path), "zip", path)) if path.is_dir() else path
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
-def _preferences(store: Store[Any], folder: Path) -> Path:
-    from prefrl.label.exchange import export_preferences
-
-    export_preferences(store, folder / "preferences.jsonl")
-    return folder / "preferences.jsonl"
-
-
-def _bundle(store: Store[Any], folder: Path) -> Path:
-    """Everything, without loss: the folder of a bundle, zipped."""
-    from prefrl.label.exchange import export_bundle
-
-    export_bundle(store, folder / "bundle")
-    return Path(shutil.make_archive(str(folder / "bundle"), "zip", folder / "bundle"))
-
-
-EXPORTS: dict[str, Callable[[Store[Any], Path], Path]] = {"jsonl": _preferences, "bundle": _bundle}
+EXPORTS: dict[str, dict[str, str]] = {
+    "text": {
+        "judgements": ".jsonl",
+        "preferences": ".jsonl",
+        "csv": ".csv",
+        "argilla": ".json",
+        "label-studio": ".json",
+        "arena": ".jsonl",
+        "dataset": "",
+        "bundle": "",
+    },
+    "control": {"bundle": "", "minari": ""},
+}
+"""The forms of `prefrl export` that a page of each kind offers, and how their files end; "" for folders."""

@@ -405,9 +405,11 @@ def test_an_admin_sees_the_project_and_takes_it_along(service: Service, ann: Tes
     assert (found["asked"], found["answered"], found["open"], found["overlap"]) == (5, 1, 4, 1)
     assert {one["name"] for one in found["annotators"]} == {"ann", "boss"}
     assert found["health"]["store"] == "ok"
-    bundle = boss.get("/api/admin/export/bundle")
-    assert bundle.status_code == 200
-    assert bundle.content[:2] == b"PK"
+    for name in found["exports"]:
+        taken = boss.get(f"/api/admin/export/{name}")
+        assert taken.status_code == 200, name
+        assert taken.headers["content-disposition"].startswith(f'attachment; filename="{name}')
+        assert (taken.content[:2] == b"PK") == (name in ("bundle", "minari"))
     assert boss.get("/api/admin/export/nothing").status_code == 404
 
 
