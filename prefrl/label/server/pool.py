@@ -7,6 +7,7 @@ so the next question is found in amortised constant time, however many there are
 from __future__ import annotations
 
 import heapq
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
@@ -35,7 +36,7 @@ class Pool:
         self._questions: dict[str, Question] = {}
         self._lists: dict[int, list[str]] = {}
         self._batches: list[int] = []
-        self._walks: dict[str, _Walk] = {}
+        self._walks: defaultdict[str, _Walk] = defaultdict(_Walk)
         self._expiries: list[tuple[float, str, str]] = []
 
     def __len__(self) -> int:
@@ -65,7 +66,7 @@ class Pool:
 
     def first(self, annotator: str) -> Question | None:
         """The first free question that this person was never given: the newest batch first, then as asked."""
-        walk = self._walk(annotator)
+        walk = self._walks[annotator]
         while walk.returned and not self._suits(walk.returned[0][2], annotator):
             heapq.heappop(walk.returned)
         found = [self._questions[walk.returned[0][2]]] if walk.returned else []
@@ -83,7 +84,7 @@ class Pool:
         """Hold a question for somebody from now on, or for longer."""
         if annotator not in question.seen:
             question.seen.add(annotator)
-            self._walk(annotator).seen_free += question.free
+            self._walks[annotator].seen_free += question.free
         until = self._clock() + self.lease_seconds
         question.leases[annotator] = until
         heapq.heappush(self._expiries, (until, question.id, annotator))
@@ -92,7 +93,7 @@ class Pool:
     def forget(self, question: Question, annotator: str) -> None:
         """Somebody was never given a question after all."""
         question.seen.discard(annotator)
-        walk = self._walk(annotator)
+        walk = self._walks[annotator]
         walk.seen_free -= question.free
         question.leases.pop(annotator, None)
         self._update(question)
@@ -119,7 +120,7 @@ class Pool:
 
     def left(self, annotator: str) -> int:
         """How many free questions this person was never given."""
-        return self.free - self._walk(annotator).seen_free
+        return self.free - self._walks[annotator].seen_free
 
     def leased(self) -> int:
         return sum(bool(question.leases) for question in self._questions.values())
@@ -130,9 +131,6 @@ class Pool:
         return sum(q.free and not q.leases and names <= q.seen for q in self._questions.values())
 
     # --- keeping count ---------------------------------------------------------------------------------------
-
-    def _walk(self, annotator: str) -> _Walk:
-        return self._walks.setdefault(annotator, _Walk())
 
     def _suits(self, id: str, annotator: str) -> bool:
         question = self._questions.get(id)
@@ -157,7 +155,7 @@ class Pool:
         if question.free:
             self.free += sign
             for name in question.seen:
-                self._walk(name).seen_free += sign
+                self._walks[name].seen_free += sign
 
     def _return(self, question: Question) -> None:
         for name, walk in self._walks.items():
