@@ -30,15 +30,15 @@ class Child:
                 env=os.environ | {"OMP_NUM_THREADS": "1", "COLUMNS": "200"},
             )
 
-    def link(self, page: Page) -> str:
+    def link(self, page: Page, seconds: int = 60) -> str:
         """Wait until it is printed. `page` keeps Playwright's events flowing in the meantime."""
-        for _ in range(600):
+        for _ in range(10 * seconds):
             found = [line for line in self.log.read_text().splitlines() if line.startswith("label here: ")]
             if found:
                 return found[-1].removeprefix("label here: ").strip()
             assert self.process.poll() is None, self.log.read_text()
             page.wait_for_timeout(100)
-        raise AssertionError(f"no link in a minute: {self.log.read_text()}")
+        raise AssertionError(f"no link in {seconds} s: {self.log.read_text()}")
 
     def finish(self, seconds: float = 60) -> int:
         """Wait for its end."""
