@@ -2,10 +2,10 @@
 
 python benchmarks/store_scale.py [--short]
 
-1,000,000 answers to 100,000 queries over 100,000 responses (short: 50,000 and 5,000), filed through the log in the
-usual way. Then, five times: open the store for writing with the service that hands out questions, all of which are
-still open; and 1,000 times: ask the service for the next question of one of 50 people, as the server does for
-`POST /api/assignments`. No peer: the numbers are compared with targets (2 s to open, p95 of 50 ms).
+1,000,000 answers to 100,000 queries over 100,000 responses (short: 50,000 and 5,000), given out and filed through the
+log as the server does. Then, five times: open the store for writing with the service that hands out questions, all of
+which are still open; and 1,000 times: ask the service for the next question of one of 50 people, as the server does
+for `POST /api/assignments`. No peer: the numbers are compared with targets (2 s to open, p95 of 50 ms).
 """
 
 from __future__ import annotations
@@ -62,15 +62,20 @@ def fill(folder: Path, queries: int, answers: int) -> None:
         with store.log.transaction() as tx:
             people = [f"person {k}" for k in range(PEOPLE)]
             tx.extend([row(f"annotator:{n}", "annotator", actor=n, body={"role": "annotator"}) for n in people])
-        done = 0
         for k in range(answers // queries):
             for i in range(0, queries, 10_000):
-                some = [
-                    Comparison(q.id, float((i + k) % 2), people[(j + k) % PEOPLE], (0, 1))
-                    for j, q in enumerate(pairs[i : i + 10_000], i)
-                ]
-                store.answer(some[: max(0, answers - done)])
-                done += len(some)
+                _answer(store, [(q.id, people[(j + k) % PEOPLE]) for j, q in enumerate(pairs[i : i + 10_000], i)])
+
+
+def _answer(store: Store[Response], work: list[tuple[str, str]]) -> None:
+    """Assignments and their answers, as the server files them, but many to a transaction."""
+    with store.log.transaction() as tx:
+        ids = [uuid.uuid4().hex for _ in work]
+        given = {"shown": [0, 1], "purpose": "label", "guideline": ""}
+        tx.extend([row(id, "assign", query, name, given) for id, (query, name) in zip(ids, work, strict=True)])
+        for id, (query, name) in zip(ids, work, strict=True):
+            about = {"submission": uuid.uuid4().hex, "digest": "", "assignment": id, "outcome": "first"}
+            store.put(tx, Comparison(query, 1.0, name, (0, 1)), about)
 
 
 def measure(folder: Path) -> tuple[list[float], list[float]]:

@@ -101,6 +101,8 @@ assignment = sql.Table(
     sql.Index("assignment_annotator", "annotator", "answered"),
 )
 """Which question was put to whom, in which order; `answered` is the number of the answer's event."""
+_waits = assignment.c.answered.is_(None)
+sql.Index("assignment_waits", assignment.c.seq, sqlite_where=_waits, postgresql_where=_waits)
 annotator = sql.Table(
     "annotator",
     metadata,

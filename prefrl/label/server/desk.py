@@ -39,11 +39,19 @@ class Desk:
 
     # --- what there is ---------------------------------------------------------------------------------------
 
-    def load(self, questions: Iterable[Question], held: Iterable[Given], closed: int, overlap: int) -> None:
+    def load(
+        self,
+        questions: Iterable[Question],
+        held: Iterable[Given],
+        closed: int,
+        overlap: int,
+        taken_back: Iterable[Given] = (),
+    ) -> None:
         """Begin anew from what the store holds: open questions, unanswered assignments, how many are closed.
 
-        Who held a question before gets it back, as far as there is room: who was given it last comes first, since
-        those before may have let it go.
+        Those of the assignments that were `taken_back` come first, the last of them before all. Who held a question
+        before gets it back, as far as there is room: who was given it last comes first, since those before may have
+        let it go.
         """
         with self._lock:
             self.policy = replace(self.policy, overlap=overlap)
@@ -53,17 +61,17 @@ class Desk:
             held = list(held)
             for given in held:
                 self._person(given.annotator).held[given.id] = given
+            for given in taken_back:
+                self._wait(given)
             for given in reversed(held):
                 self._revive(given)
 
     def add(self, questions: Iterable[Question]) -> None:
         """More questions; those that are known already are left alone."""
         with self._lock:
-            for question in questions:
-                if question.purpose == "check":
-                    self._checks.setdefault(question.id, question)
-                elif question.id not in self._pool:
-                    self._pool.add(question)
+            new = [q for q in questions if q.id not in self._pool]
+            self._checks = {q.id: q for q in new if q.purpose == "check"} | self._checks
+            self._pool.add([q for q in new if q.purpose != "check"])
 
     def knows(self, annotator: str) -> bool:
         """Whether this person's past was told."""
@@ -188,9 +196,7 @@ class Desk:
         `question` is as the store has it now; it may have been put away here.
         """
         with self._lock:
-            person = self._person(given.annotator)
-            person.held = {given.id: given} | person.held
-            person.undone.add(given.id)
+            person = self._wait(given)
             if person.past is not None:
                 person.past.answers -= 1
                 person.past.recent = [one for one in person.past.recent if one.id != given.id]
@@ -198,10 +204,18 @@ class Desk:
                 return
             if (known := self._pool.get(question.id)) is None:
                 self._closed -= 1
-                self._pool.add(question, behind=True)
+                self._pool.restore(question)
             else:
                 self._pool.count(known, question.answered)
             self._revive(given)
+
+    def _wait(self, given: Given) -> Person:
+        """Have an assignment wait for another answer, before all others of its person."""
+        person = self._person(given.annotator)
+        person.held.pop(given.id, None)
+        person.held = {given.id: given} | person.held
+        person.undone.add(given.id)
+        return person
 
     def undone(self, given: Given) -> bool:
         """Whether an answer was taken back, and waits for another one."""

@@ -7,11 +7,11 @@ so the next question is found in amortised constant time, however many there are
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from prefrl.label.server.questions import Question
+from prefrl.label.server.questions import BETWEEN, Question
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Pool:
         self.free = 0
         """How many questions somebody more can be given."""
         self._questions: dict[str, Question] = {}
-        self._lists: dict[int, list[str]] = {}
+        self._lists: defaultdict[int, list[str]] = defaultdict(list)
         self._batches: list[int] = []
         self._walks: defaultdict[str, _Walk] = defaultdict(_Walk)
         self._expiries: list[tuple[float, str, str]] = []
@@ -48,16 +48,23 @@ class Pool:
     def get(self, id: str) -> Question | None:
         return self._questions.get(id)
 
-    def add(self, question: Question, behind: bool = False) -> None:
-        """One more question; `behind` the backs of those who went past its place, because it was here before."""
-        self._questions[question.id] = question
-        if question.batch not in self._lists:
-            self._lists[question.batch] = []
-            self._batches = sorted(self._lists, reverse=True)
-        self._lists[question.batch].append(question.id)
-        question.free = self._room(question)
-        self._recount(question)
-        if behind and question.free:
+    def add(self, questions: Sequence[Question]) -> None:
+        """More questions, which nobody holds."""
+        for question in questions:
+            self._questions[question.id] = question
+            self._lists[question.batch].append(question.id)
+            question.free = self._room(question)
+        self._batches = sorted(self._lists, reverse=True)
+        free = [question.names for question in questions if question.free]
+        self.free += len(free)
+        times = Counter(BETWEEN.join(free).split(BETWEEN))
+        for name in times.keys() - {""}:
+            self._walks[name].seen_free += times[name]
+
+    def restore(self, question: Question) -> None:
+        """A question that was here before, and that people may have gone past."""
+        self.add([question])
+        if question.free:
             self._return(question)
 
     def remove(self, question: Question) -> None:

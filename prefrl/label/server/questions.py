@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 Purpose: TypeAlias = Literal["label", "check", "repeat"]
+BETWEEN = "\x1f"
+"""Between names in a text; no name that people can have holds it."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,17 @@ class Question:
     purpose: Purpose = "label"
     answered: int = 0
     """Judgements that stand, "cannot be compared" among them."""
-    seen: set[str] = field(default_factory=set)
-    """Who was given it, ever."""
+    names: str = ""
+    """Who was given it before it came here, as one text: of most of many questions nobody ever looks."""
     leases: dict[str, float] = field(default_factory=dict)
     """Who holds it, and until when."""
     free: bool = False
     """Whether somebody more can be given it; kept up by the desk."""
+
+    @cached_property
+    def seen(self) -> set[str]:
+        """Who was given it, ever."""
+        return set(filter(None, self.names.split(BETWEEN)))
 
     @property
     def key(self) -> tuple[int, int, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -13,12 +12,10 @@ from sqlalchemy import Connection
 
 from prefrl.label.server.api import HISTORY
 from prefrl.label.server.desk import REMEMBERED
-from prefrl.label.server.questions import Given, Past, Question
-from prefrl.projection import ANSWERS, CHUNK, chunks
+from prefrl.label.server.questions import BETWEEN, Given, Past, Question
+from prefrl.projection import ANSWERS, CHUNK, RETRACTED, chunks
 from prefrl.tables import assignment, event, query, setting, standing
 
-BETWEEN = "\x1f"
-"""Between names in a text; no name that people can have holds it."""
 done = query.c.judged + query.c.incomparable
 # Statements for each answer are built once: building one costs more than running it.
 _DONE = sql.select(done).where(query.c.id == sql.bindparam("b_id"))
@@ -44,27 +41,28 @@ def question(connection: Connection, id: str) -> Question:
 def _questions(connection: Connection, wanted: sql.ColumnElement[bool]) -> list[Question]:
     seen: dict[str, set[str]] = defaultdict(set)
     given = sql.select(assignment.c.query, assignment.c.annotator).join(query, query.c.id == assignment.c.query)
-    for id, name in connection.execute(given.where(wanted, assignment.c.purpose != "repeat")).all():
+    waits = assignment.c.answered.is_(None)  # who has answered has said a word
+    for id, name in connection.execute(given.where(wanted, waits, assignment.c.purpose != "repeat")).all():
         seen[id].add(name)
-    silent, nobody = _silent(connection), set[str]()
+    silent = _silent(connection)
     # Of a million words, one text of names for each query, all from the index, takes a fifth of the time of the rows.
     all_names = sql.func.aggregate_strings(standing.c.labeler, BETWEEN)
     names = sql.select(all_names).where(standing.c.query == query.c.id).scalar_subquery()
-    some = sql.select(query, done.label("done"), names.label("names")).where(wanted).order_by(query.c.seq)
-    found = []
-    for q in connection.execute(some).all():
-        who = set(map(sys.intern, q.names.split(BETWEEN))) if q.names else set()
-        who -= silent.get(q.id, nobody)
-        who |= seen.get(q.id, nobody)
-        found.append(Question(q.id, q.seq, q.batch, q.size, q.purpose, q.done, who))
+    columns = *(query.c[name] for name in ("id", "seq", "batch", "size", "purpose")), done, sql.func.coalesce(names, "")
+    found = [Question(*row) for row in connection.execute(sql.select(*columns).where(wanted).order_by(query.c.seq))]
+    for one in found:
+        if one.id in silent or one.id in seen:
+            one.names = BETWEEN.join(({*one.names.split(BETWEEN)} - silent[one.id]) | seen[one.id])
     return found
 
 
 def _silent(connection: Connection) -> dict[str, set[str]]:
     """Of each query those whose word there says nothing: it was taken back, or nobody could be asked."""
     found: dict[str, set[str]] = defaultdict(set)
-    rare = standing.c.kind.not_in((*ANSWERS, "incomparable"))
-    for id, name in connection.execute(sql.select(standing.c.query, standing.c.labeler).where(rare)).all():
+    said = (standing.c.query == event.c.subject) & (standing.c.labeler == event.c.actor)
+    some = sql.select(standing.c.query, standing.c.labeler).join(event, said & (standing.c.seq == event.c.seq))
+    rare = event.c.kind.in_(("skip", "retract")), standing.c.kind.not_in((*ANSWERS, "incomparable"))
+    for id, name in connection.execute(some.where(*rare)).all():
         found[id].add(name)
     return found
 
@@ -89,6 +87,17 @@ def unanswered(connection: Connection) -> list[Given]:
     """What was given to people and never answered, oldest first."""
     some = sql.select(assignment).where(assignment.c.answered.is_(None)).order_by(assignment.c.seq)
     return [_given(row) for row in connection.execute(some)]
+
+
+def taken_back(connection: Connection) -> list[Given]:
+    """Assignments whose answers were taken back, and that wait for others: the last that was taken back comes last.
+
+    Not repetitions, of which the first answer stands until there is another.
+    """
+    word = (standing.c.query == assignment.c.query) & (standing.c.labeler == assignment.c.annotator)
+    some = sql.select(assignment).join(standing, word & (standing.c.kind == RETRACTED))
+    waiting = assignment.c.answered.is_(None), assignment.c.purpose != "repeat"
+    return [_given(row) for row in connection.execute(some.where(*waiting).order_by(standing.c.seq))]
 
 
 def given(connection: Connection, id: str) -> tuple[Given, int | None] | None:

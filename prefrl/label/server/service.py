@@ -99,7 +99,8 @@ class Service:
             self._asked = self.seq = records.newest(connection)
             questions = records.questions(connection, overlap)
             closed = records.closed(connection, overlap)
-            self.desk.load(questions, records.unanswered(connection), closed, overlap)
+            back = records.taken_back(connection)
+            self.desk.load(questions, records.unanswered(connection), closed, overlap, back)
 
     def refresh(self) -> None:
         """Have the desk know what was asked since."""

@@ -11,7 +11,7 @@ from stores import responses
 from web_service import answering, ask_for, browser, invite, log_in, serving
 
 from prefrl.label.server.desk import Desk
-from prefrl.label.server.questions import Given, Past, Policy, Question
+from prefrl.label.server.questions import BETWEEN, Given, Past, Policy, Question
 from prefrl.store import Store
 
 
@@ -108,7 +108,7 @@ def test_taking_back_that_arrives_twice_does_not_take_back_the_next_answer(texts
 
 
 def test_after_a_restart_a_question_is_held_by_who_was_given_it_last() -> None:
-    question = Question("q", 1, 1, 2, seen={"ann", "ben"})
+    question = Question("q", 1, 1, 2, names=BETWEEN.join(["ann", "ben"]))
     gone, at_work = Given("a" * 32, "q", "ann", "label", (0, 1)), Given("b" * 32, "q", "ben", "label", (1, 0))
     desk = Desk(Policy())
     desk.load([question], [gone, at_work], 0, 1)

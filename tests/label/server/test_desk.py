@@ -109,7 +109,7 @@ def test_an_answer_that_is_taken_back_is_the_next_question_of_the_same_person() 
     given = made.pick("ann", 1)[1][0]
     made.answered(given, 1)
     made.pick("ann", 1)
-    made.reopened(given, Question(given.query, 1000, 1, 2, "label", 0, {"ann"}))
+    made.reopened(given, Question(given.query, 1000, 1, 2, "label", 0, "ann"))
     assert made.pick("ann", 1)[0] == [given]
     assert made.counts().answered == 0
     assert made.pick("ben", 2) == ([], [])
@@ -123,7 +123,7 @@ def test_an_answer_that_is_taken_back_and_left_goes_to_others() -> None:
     given = made.pick("ann", 1)[1][0]
     made.answered(given, 1)
     assert len(label_all(made, "ben")) == 2
-    made.reopened(given, Question(given.query, 1000, 1, 2, "label", 0, {"ann"}))
+    made.reopened(given, Question(given.query, 1000, 1, 2, "label", 0, "ann"))
     clock.now += 1000
     assert [g.query for g in label_all(made, "ben")] == [given.query]
 
@@ -141,13 +141,24 @@ def test_after_a_restart_people_get_back_what_they_held() -> None:
     given = Given("a" * 32, "label-1-0", "ann", "label", (1, 0))
     made = Desk(Policy(overlap=1), Clock())
     held = asked(2)
-    held[0].seen.add("ann")
+    held[0].names = "ann"
     made.load(held, [given], 3, 1)
     made.tell("ben", Past())
     made.tell("ann", Past(given=1))
     assert [g.query for g in made.pick("ben", 4)[1]] == ["label-1-1"]
     assert made.pick("ann", 1) == ([given], [])
     assert made.counts().asked == 5
+
+
+def test_after_a_restart_what_was_taken_back_still_comes_first_though_others_have_answered() -> None:
+    held = [Given(f"{n}" * 32, f"label-1-{n}", "ann", "label", (0, 1)) for n in range(3)]
+    made = Desk(Policy(overlap=1), Clock())
+    questions = asked(2)
+    for question in questions:
+        question.names = "ann"
+    made.load(questions, held, 1, 1, taken_back=[held[1], held[2]])
+    made.tell("ann", Past(given=3))
+    assert made.pick("ann", 3) == ([held[2], held[1], held[0]], [])
 
 
 def test_checks_come_now_and_then_and_once_to_each_person() -> None:
