@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
+from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,13 +40,15 @@ FEW = 20
 def run(
     source: Source,
     overrides: Overrides = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The run's folder.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The run's folder; a new one under runs/ if not given.")
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option(help="Build everything, run a small round, estimate time, write nothing.")
     ] = False,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
-    from prefrl.console import drive
+    from prefrl.console import drive, say
     from prefrl.rundir import Run
 
     config = _load(source, overrides)
@@ -52,7 +56,8 @@ def run(
         _dry_run(config)
         return
     if out is None:
-        raise typer.BadParameter("say where the run goes: --out DIR (or --dry-run)")
+        out = _new_folder(source)
+        say(f"the run's folder: {out}")
     drive(Run(config, out))
 
 
@@ -222,6 +227,14 @@ def doctor() -> None:
     from prefrl.doctor import diagnose
 
     console.print(diagnose())
+
+
+def _new_folder(source: str) -> Path:
+    """Of a run of control/hopper: runs/control-hopper-20261124-091500, with a 2 behind it where that is taken."""
+    name = Path(source).stem if Path(source).exists() else source.replace("/", "-")
+    first = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    later = (first.with_name(f"{first.name}-{number}") for number in count(2))
+    return next(folder for folder in chain([first], later) if not folder.exists())
 
 
 def _load(source: str, overrides: list[str] | None) -> Config:

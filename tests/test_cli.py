@@ -140,9 +140,13 @@ def test_a_mistake_gets_a_line_on_stderr_and_status_two(prefrl: Shell, line: str
     assert prefrl.out == ""
 
 
-def test_a_run_without_a_folder_says_what_is_missing(prefrl: Shell) -> None:
-    assert prefrl("run control/toy") == 2
-    assert "--out DIR" in prefrl.err
+def test_a_run_without_a_folder_makes_a_new_one_and_says_which(prefrl: Shell) -> None:
+    for number in (1, 2):
+        assert prefrl("run control/toy loop.rounds=1") == 0
+        told = re.search(r"the run's folder: (runs/control-toy-\d{8}-\d{6}(-2)?)$", prefrl.out, re.MULTILINE)
+        assert told is not None
+        assert Path(told[1], "report.html").exists()
+        assert len(list(Path("runs").iterdir())) == number
 
 
 def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -> None:
