@@ -194,7 +194,11 @@ class RewardModel(Protocol[C_contra]):
         """Candidates as padded tensors with N in front, made once per fit."""
 
     def scores(self, stacked: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """(E, N) raw scores of stacked candidates, differentiable."""
+        """(E, N) raw scores of stacked candidates, differentiable.
+
+        A fit may add `used` (N, E) bool to what was stacked: where it is false, that member's score counts nothing, and
+        need not be computed; any finite number does.
+        """
 
     def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 

@@ -80,14 +80,15 @@ class CNN:
 
     def outputs(self, inputs: Tensor) -> Tensor:
         pixels = math.prod(self._image)
-        steps = inputs.flatten(0, 1)
-        x = steps[:, :pixels].reshape(-1, *self._image).permute(0, 3, 1, 2)
+        steps = inputs.view(-1, *inputs.shape[-3:]).flatten(1, 2)  # (1, S, I), or (E, S, I) of each member's own
+        pictures = steps[:, :, :pixels].reshape(*steps.shape[:2], *self._image)
+        x = pictures.permute(1, 0, 4, 2, 3).flatten(1, 2)
         for i, (weight, bias) in enumerate(zip(self._filters, self._biases, strict=True)):
-            # All members see one picture, so the first layer is one convolution with the filters of all.
-            x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else 1))
-        seen = x.reshape(len(steps), self.members, -1).transpose(0, 1)
-        both = torch.cat([seen, steps[:, pixels:].expand(self.members, -1, -1)], 2)
-        return self._head.of_members(both).view(self.members, *inputs.shape[:2])
+            # Where all see one picture, the first layer is one convolution with the filters of all.
+            x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else len(steps)))
+        seen = x.reshape(len(x), self.members, -1).transpose(0, 1)
+        both = torch.cat([seen, steps[:, :, pixels:].expand(self.members, -1, -1)], 2)
+        return self._head.of_members(both).view(self.members, *inputs.shape[-3:-1])
 
 
 def _check(image: tuple[int, int, int], task: ControlTask) -> None:

@@ -70,8 +70,8 @@ class Linear:
         return None if self._quadratic else (self._weight, self._bias)
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        x = self.features(inputs).flatten(0, 1).expand(self.members, -1, -1)
-        return torch.baddbmm(self._bias, x, self._weight).view(self.members, *inputs.shape[:2])
+        x = self.features(inputs).flatten(-3, -2).expand(self.members, -1, -1)
+        return torch.baddbmm(self._bias, x, self._weight).view(self.members, *inputs.shape[-3:-1])
 
     def features(self, inputs: Tensor) -> Tensor:
         """(..., I) -> (..., d)."""

@@ -63,8 +63,8 @@ class GRU:
         return self._p["input_weight"], self._p["input_bias"]
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        p, (rows, steps) = self._p, inputs.shape[:2]
-        x = inputs.transpose(0, 1).flatten(0, 1).expand(self.members, -1, -1)
+        p, (rows, steps) = self._p, inputs.shape[-3:-1]
+        x = inputs.transpose(-3, -2).flatten(-3, -2).expand(self.members, -1, -1)
         gates = torch.baddbmm(p["input_bias"], x, p["input_weight"]).view(self.members, steps, rows, -1).unbind(1)
         state, states = inputs.new_zeros(self.members, rows, p["state_weight"].shape[1]), list[Tensor]()
         for gate in gates:
@@ -147,8 +147,8 @@ class PreferenceTransformer:
         return self._p["input_weight"], self._p["input_bias"]
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        steps = inputs.shape[1]
-        x = self._apply("input", inputs.expand(self.members, *inputs.shape)) + self._p["place"][:, None, :steps]
+        steps = inputs.shape[-2]
+        x = self._apply("input", inputs.expand(self.members, *inputs.shape[-3:])) + self._p["place"][:, None, :steps]
         for i in range(self._layers):
             q, k, v = self._apply(f"layer_{i}_qkv", _normed(x)).chunk(3, -1)
             x = x + self._apply(f"layer_{i}_mix", self._attention(q, k, v))

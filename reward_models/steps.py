@@ -20,7 +20,7 @@ from prefrl.reward_models.history import looking_back
 from prefrl.types import Floats, Segment, State
 
 STEPS, NUMBERS = 4096, 4_194_304
-"""Steps, and numbers in their inputs, that go through a network at once: what it makes of them then stays in cache."""
+"""Steps of all members, and numbers in one's inputs, that go through at once: what is made of them stays in cache."""
 
 Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
@@ -42,7 +42,10 @@ class Network(Protocol):
         """Everything that is saved. What is a parameter is fitted by descent."""
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        """(B, T, I) normalised steps, T <= memory -> (E, B, T). No step sees a later one."""
+        """(B, T, I) normalised steps, T <= memory (or any where memory is 1), or (E, B, T, I), each member's own.
+
+        Returns (E, B, T). No step sees a later one.
+        """
 
     @property
     def first(self) -> tuple[Tensor, Tensor] | None:
@@ -104,6 +107,8 @@ class StepReward:
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         inputs, mask = stacked["inputs"], stacked["mask"]
+        if "used" in stacked and (self.memory == 1 or mask.shape[1] <= self.memory):
+            return self._used_scores(inputs, mask, stacked["used"])
         if self.memory == 1:
             outputs = self._outputs(inputs.flatten(0, 1), np.zeros(0)).view(self.members, *mask.shape)
         elif mask.shape[1] <= self.memory:
@@ -112,6 +117,15 @@ class StepReward:
             outputs = mask.new_zeros(self.members, *mask.shape)
             outputs[:, mask.bool()] = self._outputs(*_flat(inputs, mask))
         return (outputs * mask).sum(2) * self._gain
+
+    def _used_scores(self, inputs: Tensor, mask: Tensor, used: Tensor) -> Tensor:
+        """`scores` where each member passes over what it does not use (N, E): about a third, after a bootstrap."""
+        count = max(1, int(used.sum(0).max()))
+        first = used.T.long().argsort(stable=True, dim=1, descending=True)[:, :count]  # filled up with unused ones
+        rows = max(1, self._most(inputs) // mask.shape[1])
+        outputs = torch.cat([self.network.outputs(inputs[at]) for at in torch.split(first, rows, 1)], 1)
+        sums = (outputs * mask[first]).sum(2) * self._gain
+        return sums.new_zeros(used.T.shape).scatter(1, first, sums)
 
     @torch.no_grad()
     def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
@@ -197,10 +211,14 @@ class StepReward:
 
     def _outputs(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
         """(S, I) normalised steps of pieces that start where `begins` (S,) says -> (E, S): before shift and scale."""
-        most = max(1, min(STEPS, NUMBERS // inputs.shape[1]))
+        most = self._most(inputs)
         if self.memory > 1:
             return looking_back(self.network.outputs, inputs, begins, self.memory, most)
         return torch.cat([self.network.outputs(x[:, None])[:, :, 0] for x in torch.split(inputs, most)], 1)
+
+    def _most(self, inputs: Tensor) -> int:
+        """How many steps (..., I) go through at once."""
+        return max(1, min(STEPS // self.members, NUMBERS // inputs.shape[-1]))
 
     def _normalised(self, steps: Tensor) -> Tensor:
         return (steps - self._input_mean).div_(self._input_std)

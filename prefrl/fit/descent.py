@@ -60,8 +60,13 @@ class Problem(Generic[C]):
         mentioned = torch.cat([part.candidates(), extra.flatten()])
         needed, here = torch.unique(mentioned, return_inverse=True)
         stacked: Mapping[str, Tensor] = {name: x[needed] for name, x in self.stacked.items()}
-        scores = self.reward.scores(semi.crop(stacked, fitting.crop, order) if fitting.crop else stacked)
-        loss = weighted_mean(self.likelihood.losses(part.over(here), scores), weights(part, weight))
+        if fitting.crop:
+            stacked = semi.crop(stacked, fitting.crop, order)
+        counts, here_terms = weights(part, weight), part.over(here)
+        if not (fitting.centre or len(extra) or counts.all()):
+            stacked = {**stacked, "used": _used(here_terms, counts, len(needed))}
+        scores = self.reward.scores(stacked)
+        loss = weighted_mean(self.likelihood.losses(here_terms, scores), counts)
         if fitting.reliability == "learned":
             loss = loss + (self.likelihood.prior() / weights(self.train, self.weight).sum(1)).sum()
         if fitting.centre:
@@ -191,6 +196,15 @@ def _alternate(problem: Problem[C]) -> None:
         scores = problem.reward.settle(problem.stacked, problem.total)
         _minimise(partial(_own_loss, problem, scores), own)
         problem.reward.load(before)
+
+
+def _used(part: Terms, counts: Tensor, candidates: int) -> Tensor:
+    """(N, E) bool: which candidates stand in a term that counts (E, S + R) for that member."""
+    count, width = part.choices.items.shape
+    counted = counts.bool()
+    mentions = torch.cat([counted[:, :count].repeat_interleave(width, 1), counted[:, count:]], 1)
+    used = torch.zeros(candidates, len(counts))
+    return used.index_add_(0, part.candidates(), mentions.T.float()).bool()
 
 
 def _own_loss(problem: Problem[C], scores: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -86,6 +86,33 @@ def test_with_the_bootstrap_members_differ_more_than_by_their_start(judged: list
         return float(reward.member_scores([c for j in judged[200:] for c in j.query.candidates]).std(0).mean())
 
     assert spread(True) > 1.1 * spread(False)
+
+
+@pytest.mark.parametrize("ratings", [0, 10])
+def test_a_member_computes_what_its_bootstrap_drew_and_learns_the_same(
+    judged: list[Judged[Segment]], ratings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rated = [Judged(one.query, Rating(one.query.id, (1, i % 3), 3)) for i, one in enumerate(judged[50 : 50 + ratings])]
+    seen: list[int] = []
+
+    def weights(thrifty: bool) -> list[torch.Tensor]:
+        reward = model()
+        scores = reward.scores
+
+        def watched(stacked: Mapping[str, torch.Tensor]) -> torch.Tensor:
+            seen.append(int(stacked["used"].sum()) if "used" in stacked else 0)
+            found: torch.Tensor = scores(stacked if thrifty else {k: x for k, x in stacked.items() if k != "used"})
+            return found
+
+        monkeypatch.setattr(reward, "scores", watched)
+        fit_judged(reward, judged[:50] + rated, FittingSettings(epochs=3, held_out=0), np.random.default_rng(0))
+        return [p.detach() for p in reward.parameters()]
+
+    thrifty, lavish = weights(True), weights(False)
+    for one, other in zip(thrifty[:-1], lavish[:-1], strict=True):  # the last bias moves by rounding alone
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    candidates = 2 * (50 + ratings) * 2 * 3  # of two members in three epochs
+    assert 0.55 * candidates < sum(seen) / 2 < 0.75 * candidates  # 1 - 1/e of them
 
 
 def test_the_same_judgements_and_seed_give_the_same_bytes(judged: list[Judged[Segment]]) -> None:

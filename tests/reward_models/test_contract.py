@@ -146,6 +146,18 @@ def test_a_score_does_not_hang_on_what_else_is_in_the_batch_or_on_padding(kind: 
 
 
 @EACH
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_what_a_member_does_not_use_changes_nothing_that_it_does(kind: str, share: float) -> None:
+    model = _settled(kind)
+    stacked = model.stack(_segments(9, lengths=(5, 3)))
+    used = torch.rand(9, 3, generator=torch.Generator().manual_seed(0)) < share
+    every, some = model.scores(stacked), model.scores({**stacked, "used": used})
+    assert some.shape == (3, 9)
+    assert some.isfinite().all()
+    torch.testing.assert_close(some[used.T], every[used.T], rtol=1e-4, atol=1e-5)
+
+
+@EACH
 @pytest.mark.parametrize("combine", [{}, {"by": "lower", "caution": 0.5}, {"by": "worst", "optimism": 0.3}])
 @pytest.mark.parametrize("members", [1, 3])
 def test_a_score_is_the_sum_of_the_rewards_of_its_steps(kind: str, members: int, combine: dict[str, Any]) -> None:
