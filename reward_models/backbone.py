@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
+from jinja2 import TemplateError
 from torch import Tensor
 from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.models.auto.modeling_auto import MODEL_FOR_MASKED_LM_MAPPING_NAMES
@@ -22,34 +23,40 @@ from transformers.utils.logging import (
 )
 
 from prefrl.components import ConfigError
+from prefrl.label.transcripts import prompt_messages, response_messages
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
 from prefrl.types import Response
 
 Train = Literal["full", "lora", "head"]
+Pool = Literal["last", "first", "mean", "own"]
 BUCKET = 16
 """Rows of like length that share a padded pass, where a model cannot be packed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Backbone:
-    """A transformer without a head, and how responses become its tokens."""
+    """A transformer without its last layer, and how responses become its tokens."""
 
     model: PreTrainedModel
     """In evaluation mode, so without dropout, in fits as well."""
     tokenizer: PreTrainedTokenizerBase
     policy_end: int | None
     """The policy's end token where the tokens it sampled must be encoded anew, None where they are read as they are."""
-    pool: Literal["last", "first", "mean"] = "last"
-
-    @property
-    def width(self) -> int:
-        return int(self.model.config.hidden_size)
+    width: int
+    """Of what the heads see."""
+    pool: Pool = "last"
+    """`own`: an encoder's classifier pools as it was made to, and the heads see what its last layer was given."""
+    head: str = ""
+    """With `own`, the path of that layer, which is now the identity."""
+    chat: bool = False
+    """Whether prompt and response are put into the tokenizer's chat template."""
 
     @property
     def context(self) -> int | None:
         """The most tokens that the model has positions for."""
         known = [getattr(self.model.config, "max_position_embeddings", None)]  # some architectures have no bound
+        known += _after_padding(self.model)
         if self.policy_end is not None:
             known.append(self.tokenizer.model_max_length)
         return min((int(n) for n in known if n), default=None)
@@ -78,13 +85,19 @@ class Backbone:
     def _padded_states(self, tokens: Tensor, lengths: Tensor) -> Tensor:
         tokens = tokens[:, : int(lengths.max())]
         mask = torch.arange(tokens.shape[1]) < lengths[:, None]
-        hidden: Tensor = self.model(input_ids=tokens, attention_mask=mask.long()).last_hidden_state
+        found = self.model(input_ids=tokens, attention_mask=mask.long())
+        hidden: Tensor = found.logits if self.pool == "own" else found.last_hidden_state
+        if self.pool == "own":
+            return hidden
         if self.pool == "mean":
             return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]
         return hidden[torch.arange(len(tokens)), lengths - 1 if self.pool == "last" else 0]
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
+        ended = not response.tokens or response.tokens[-1] == self.policy_end
+        if self.chat:
+            return in_turns(self.tokenizer, response, ended)
         sampled = self.policy_end is None
         prompt = list((sampled and response.prompt_tokens) or self.tokenizer.encode(response.prompt))
         if sampled and response.tokens:
@@ -92,8 +105,29 @@ class Backbone:
         end = end_token(self.tokenizer)
         if self.pool == "last" and prompt[-1:] == [end]:  # some tokenizers end all that they encode
             prompt.pop()
-        ended = not response.tokens or response.tokens[-1] == self.policy_end
         return [*prompt, *self.tokenizer.encode(response.text, add_special_tokens=False), *[end] * ended]
+
+    def weights(self) -> dict[str, torch.nn.Parameter]:
+        """What the heads' view hangs on, by name: all but a pooler, unless it is a classifier's own."""
+        return {n: p for n, p in self.model.named_parameters() if self.pool == "own" or "pooler" not in n}
+
+
+def in_turns(tokenizer: PreTrainedTokenizerBase, response: Response, ended: bool) -> list[int]:
+    """The turns of prompt and response in the chat template, which begins and ends them; a cut response stays open.
+
+    A prompt that is no transcript is what the user says. Raises ValueError where the template refuses the turns.
+    """
+    asked = prompt_messages(response.prompt)
+    said = [{"role": "assistant", "content": response.text}] if asked is None else response_messages(response.text)
+    turns = [*(asked or [{"role": "user", "content": response.prompt}]), *said]
+    try:
+        found = tokenizer.apply_chat_template(turns, continue_final_message=not ended, return_dict=False)
+    except (TemplateError, ValueError) as error:
+        raise ValueError(
+            f"candidate {response.id[:12]} does not fit the chat template of the reward's tokenizer: "
+            f"{first_line(error)}; leave it out, or set reward.chat_template=false"
+        ) from error
+    return list(found)
 
 
 def end_token(tokenizer: PreTrainedTokenizerBase) -> int:
@@ -107,34 +141,47 @@ def end_token(tokenizer: PreTrainedTokenizerBase) -> int:
     return int(found)
 
 
-def of_policy(task: TextTask) -> Backbone:
-    """The task's starting policy, reading what was sampled."""
-    return _ready(task.model().base_model, task.tokenizer, None, "mean")
+def of_policy(task: TextTask, chat: bool) -> Backbone:
+    """The task's starting policy, reading what was sampled, or the text where it is put into a chat template."""
+    return _ready(task.model().base_model, task.tokenizer, task, "mean", chat)
 
 
-def of_folder(name: str, task: TextTask, download: bool, pool: Literal["first", "mean"]) -> Backbone:
+def of_folder(name: str, task: TextTask, download: bool, pool: Literal["first", "mean"], chat: bool) -> Backbone:
     """A model of transformers by folder or name. Raises `ConfigError` where it cannot be used."""
-    model = load_weights(AutoModel, name, download)
-    tokenizer = load_tokenizer(name, download)
-    same = tokenizer.get_vocab() == task.tokenizer.get_vocab()
-    return _ready(model, tokenizer, None if same else end_token(task.tokenizer), pool)
+    return _ready(load_weights(AutoModel, name, download), load_tokenizer(name, download), task, pool, chat)
 
 
-def of_classifier(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, task: TextTask) -> Backbone:
-    """What is under a sequence classifier."""
-    same = tokenizer.get_vocab() == task.tokenizer.get_vocab()
-    return _ready(model, tokenizer, None if same else end_token(task.tokenizer), "mean")
+def of_classifier(model: Any, head: str, tokenizer: PreTrainedTokenizerBase, task: TextTask, chat: bool) -> Backbone:
+    """A sequence classifier without its last layer, which is at the path `head`: of a causal one what is under it."""
+    width, encoder = int(model.get_submodule(head).in_features), is_encoder(model)
+    if encoder:
+        model.set_submodule(head, torch.nn.Identity())
+    ready = _ready(model if encoder else model.base_model, tokenizer, task, "own", chat)
+    return replace(ready, width=width, head=head if encoder else "")
 
 
-def _ready(
-    model: Any, tokenizer: PreTrainedTokenizerBase, policy_end: int | None, pool: Literal["first", "mean"]
-) -> Backbone:
+def is_encoder(model: PreTrainedModel) -> bool:
+    return model.config.model_type in MODEL_FOR_MASKED_LM_MAPPING_NAMES
+
+
+def _ready(model: Any, tokenizer: PreTrainedTokenizerBase, task: TextTask, pool: Pool, chat: bool) -> Backbone:
     if model.config.is_encoder_decoder:
         raise ConfigError(f"a {model.config.model_type} has an encoder and a decoder: choose a backbone with one stack")
+    if chat and tokenizer.chat_template is None:
+        raise ConfigError("reward.chat_template is true, but the reward's tokenizer has no chat template")
     if model.config.model_type in MODELS:
         use_packed_attention(model)
-    encoder = model.config.model_type in MODEL_FOR_MASKED_LM_MAPPING_NAMES
-    return Backbone(model.eval(), tokenizer, policy_end, pool if encoder else "last")
+    same = tokenizer is task.tokenizer or tokenizer.get_vocab() == task.tokenizer.get_vocab()
+    policy_end = None if same and not chat else end_token(task.tokenizer)
+    pool = pool if is_encoder(model) else "last"
+    return Backbone(model.eval(), tokenizer, policy_end, int(model.config.hidden_size), pool, chat=chat)
+
+
+def _after_padding(model: PreTrainedModel) -> list[int]:
+    """How many positions are left where they are counted from the one after padding's, as RoBERTa does."""
+    tables = [m for n, m in model.named_modules() if n.endswith("position_embeddings")]
+    starts = [(m, m.padding_idx) for m in tables if isinstance(m, torch.nn.Embedding)]
+    return [m.num_embeddings - start - 1 for m, start in starts if start is not None]
 
 
 def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
@@ -148,7 +195,8 @@ def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
     except (OSError, ValueError) as error:
         hint = first_line(error) if download else "only local files are looked at unless reward.download is true"
         raise ConfigError(f"no model in safetensors could be read from {name!r}: {hint}") from error
-    if missing := sorted(k for k in info["missing_keys"] if "pooler" not in k):
+    headless = auto is AutoModel  # then nothing reads a pooler
+    if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
         raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
     found: PreTrainedModel = model
     return found
@@ -169,12 +217,11 @@ def first_line(error: Exception) -> str:
     return str(error).strip().partition("\n")[0]
 
 
-def trainable(model: PreTrainedModel, train: Train) -> dict[str, torch.nn.Parameter]:
-    """What a fit changes, by name. A pooler is no part of what the heads see."""
+def trainable(backbone: Backbone, train: Train) -> dict[str, torch.nn.Parameter]:
+    """What a fit changes, by name."""
     if train == "head":
         return {}
-    named = ((n, p) for n, p in model.named_parameters() if "pooler" not in n)
-    return {n: p for n, p in named if train == "full" or "lora_" in n}
+    return {n: p for n, p in backbone.weights().items() if train == "full" or "lora_" in n}
 
 
 def digest(named: Mapping[str, Tensor]) -> str:

@@ -16,7 +16,16 @@ from transformers import AutoModelForSequenceClassification, PreTrainedModel, Pr
 from prefrl.components import ConfigError
 from prefrl.files import whole_folder, write_file
 from prefrl.protocols import TextTask
-from prefrl.reward_models.backbone import end_token, load_tokenizer, load_weights, of_classifier, quiet
+from prefrl.reward_models.backbone import (
+    Backbone,
+    end_token,
+    is_encoder,
+    load_tokenizer,
+    load_weights,
+    of_classifier,
+    quiet,
+)
+from prefrl.reward_models.packing import ATTENTION
 from prefrl.reward_models.text import TransformerReward, TransformerSettings
 
 PAD = "<|pad|>"
@@ -28,36 +37,78 @@ def load_classifier(
 ) -> TransformerReward:
     """A reward model of one member from an `AutoModelForSequenceClassification` checkpoint: its scores are its logits.
 
-    Raises `ConfigError` unless it has one label and one linear head on the last token.
+    Raises `ConfigError` unless it has one label, and is a causal model with one linear head on the last token or an
+    encoder that ends in one linear layer, whatever it has before that.
     """
     model: Any = load_weights(AutoModelForSequenceClassification, name, settings.download)
     if model.config.num_labels != 1:
         raise ConfigError(f"{name} tells {model.config.num_labels} labels apart; a reward model has num_labels=1")
-    head: Any = dict(model.named_children()).get("score")
-    if not isinstance(head, torch.nn.Linear) or [name for name, _ in head.named_parameters()] != ["weight"]:
-        raise ConfigError(f"{name} is a {model.config.model_type} without a linear head `score`: use it as a backbone")
-    backbone = of_classifier(model.base_model, load_tokenizer(name, settings.download), task)
+    path, tokenizer = _last_layer(model, name), load_tokenizer(name, settings.download)
+    head, alone = model.get_submodule(path), _logit(model) if is_encoder(model) else None
+    chat = tokenizer.chat_template is not None if settings.chat_template is None else settings.chat_template
+    backbone = of_classifier(model, path, tokenizer, task, chat)
+    if alone is not None and not torch.allclose(_padded_logit(backbone, head), alone, rtol=1e-4, atol=1e-5):
+        raise ConfigError(
+            f"{name}: the score of a {type(model).__name__} hangs on padding, or is not what its last linear layer "
+            f"`{path}` says; use it as a backbone"
+        )
     reward = TransformerReward(settings, backbone, rng)
-    reward.start_from(head.weight)
+    reward.start_from(head)
     return reward
+
+
+def _last_layer(model: Any, name: str) -> str:
+    """The path of the linear layer that makes the score."""
+    inner = set(model.base_model.modules())
+    layers = ((path, m) for path, m in model.named_modules() if m not in inner)
+    found: list[str] = [path for path, m in layers if isinstance(m, torch.nn.Linear) and m.out_features == 1]
+    if len(found) != 1 or not (is_encoder(model) or found[0] == "score"):
+        raise ConfigError(
+            f"{name} is a {type(model).__name__}: expected a causal model with one linear layer `score`, or an encoder "
+            "that ends in one linear layer; use it as a backbone"
+        )
+    return found[0]
+
+
+PROBE = torch.tensor([[2, 3, 4, 0, 0, 0], [2, 3, 4, 5, 6, 7]])
+"""Two rows: the first one is three tokens and padding."""
+
+
+@torch.no_grad()
+def _logit(model: Any) -> torch.Tensor:
+    """What transformers' own class says of the first row, on its own."""
+    found: torch.Tensor = model(input_ids=PROBE[:1, :3], attention_mask=torch.ones(1, 3).long()).logits
+    return found
+
+
+@torch.no_grad()
+def _padded_logit(backbone: Backbone, head: torch.nn.Module) -> torch.Tensor:
+    """What a head on our features says of it, beside a longer row."""
+    found: torch.Tensor = head(backbone.states(PROBE, torch.tensor([3, 6])))
+    return found[:1]
 
 
 def save_classifier(reward: TransformerReward, folder: Path) -> float:
     """Write a reward model as an `AutoModelForSequenceClassification` checkpoint with its tokenizer.
 
-    Its logit is the mean of the members after shift and scale, less a constant, since such heads have no bias; the
-    constant is returned. Adapters are merged. Padding gets a token of its own where it is missing, or is the end
-    token: classifiers look for the last token that is no padding. Raises ValueError for an encoder.
+    Its logit is the mean of the members after shift and scale, less a constant where such heads have no bias, as those
+    of causal models; the constant is returned. Adapters are merged. A chat template is written only if the model reads
+    by it. Raises ValueError for an encoder that did not come from a checkpoint.
     """
-    if reward.backbone.pool != "last":
-        kind = reward.backbone.model.config.model_type
+    backbone, (weight, constant) = reward.backbone, reward.mean_head()
+    if backbone.pool not in ("last", "own"):
         raise ValueError(
-            f"a {kind} is an encoder, whose classifiers have deeper heads: only causal models are exported"
+            f"a {backbone.model.config.model_type} is an encoder, whose classifiers have deeper heads than ours: only "
+            "causal models, and encoders that came from a reward.checkpoint, are exported"
         )
-    tokenizer = copy.deepcopy(reward.backbone.tokenizer)
-    weight, constant = reward.mean_head()
-    model = _classifier(_without_adapters(reward.backbone.model), weight)
-    _give_padding(model, tokenizer)
+    tokenizer, model = copy.deepcopy(backbone.tokenizer), _without_adapters(backbone.model)
+    if not backbone.chat:
+        tokenizer.chat_template = None
+    if backbone.pool == "own":
+        model, constant = _closed(model, backbone.head, weight, constant), 0.0
+    else:
+        model = _classifier(model, weight)
+        _give_padding(model, tokenizer)
     with whole_folder(folder) as work, quiet():
         model.save_pretrained(work)
         tokenizer.save_pretrained(work)
@@ -75,7 +126,9 @@ def _without_adapters(model: PreTrainedModel) -> PreTrainedModel:
 def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedModel:
     """The backbone under one linear head (d,)."""
     config = copy.deepcopy(backbone.config)
-    config.num_labels, config._attn_implementation = 1, "sdpa"
+    config.num_labels = 1
+    if config._attn_implementation == ATTENTION:
+        config._attn_implementation = None  # whatever the architecture has by default
     with torch.random.fork_rng(devices=[]):
         model: Any = AutoModelForSequenceClassification.from_config(config)  # type: ignore[no-untyped-call]
     model.base_model.load_state_dict(backbone.state_dict())
@@ -84,7 +137,18 @@ def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedMo
     return found
 
 
+def _closed(model: PreTrainedModel, path: str, weight: torch.Tensor, bias: float) -> PreTrainedModel:
+    """A copy of an encoder's classifier with a last layer again: (d,) and a number."""
+    found = copy.deepcopy(model)
+    head = torch.nn.utils.skip_init(torch.nn.Linear, len(weight), 1)  # type: ignore[no-untyped-call]
+    head.weight.data.copy_(weight[None])
+    head.bias.data.fill_(bias)
+    found.set_submodule(path, head)
+    return found
+
+
 def _give_padding(model: Any, tokenizer: PreTrainedTokenizerBase) -> None:
+    """Of its own where it is missing or is the end: causal classifiers look for the last token that is no padding."""
     if tokenizer.pad_token_id is None or tokenizer.pad_token_id == end_token(tokenizer):
         tokenizer.add_special_tokens({"pad_token": PAD})
         if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:

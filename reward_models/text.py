@@ -32,6 +32,9 @@ class TransformerSettings(Settings):
     """A folder, or a name, that transformers can load; the task's starting policy when not given."""
     checkpoint: str = ""
     """A sequence classifier with one label, by folder or name: its backbone and its head are where the model starts."""
+    chat_template: bool | None = None
+    """Whether prompt and response are put into the chat template of the tokenizer; by default only those of a
+    checkpoint whose tokenizer has one."""
     download: bool = False
     """Whether a name may be looked up on the Hugging Face Hub; otherwise only local files are read."""
     members: int = Field(3, ge=1)
@@ -45,7 +48,8 @@ class TransformerSettings(Settings):
     lora_targets: Literal["all-linear", "default"] = "all-linear"
     """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
     pool: Literal["mean", "first"] = "mean"
-    """What the heads see of an encoder: the mean over tokens, or the first. Of a causal model it is always the last."""
+    """What the heads see of an encoder: the mean over tokens, or the first. Of a causal model it is always the last,
+    and the checkpoint of an encoder has its own way."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of the backbone's products; weights, heads and scores are always float32."""
 
@@ -61,9 +65,9 @@ class TransformerSettings(Settings):
 
             return load_classifier(self.checkpoint, _text(task), self, rng)
         if self.backbone:
-            backbone = of_folder(self.backbone, _text(task), self.download, self.pool)
+            backbone = of_folder(self.backbone, _text(task), self.download, self.pool, bool(self.chat_template))
         else:
-            backbone = of_policy(_text(task))
+            backbone = of_policy(_text(task), bool(self.chat_template))
         return TransformerReward(self, backbone, rng)
 
 
@@ -71,8 +75,8 @@ class TransformerReward:
     """A `prefrl.protocols.RewardModel` of responses (Stiennon et al. 2020, section 3.4: a score at the end).
 
     It reads the tokens as they were sampled, the end token included, so it sees whether a response has ended; a
-    backbone with another tokenizer reads the text, with an end of its own. Evaluation mode, no dropout. Heads start
-    from N(0, 1 / (d + 1)).
+    backbone with another tokenizer, or with a chat template, reads the text, with an end of its own. Evaluation mode,
+    no dropout. Heads start from N(0, 1 / (d + 1)).
     """
 
     def __init__(self, settings: TransformerSettings, backbone: Backbone, rng: np.random.Generator) -> None:
@@ -87,7 +91,7 @@ class TransformerReward:
             from prefrl.reward_models.lora import add_adapters  # peft takes seconds to load
 
             add_adapters(backbone.model, settings.lora_rank, settings.lora_targets, rng)
-        self._trained = trainable(backbone.model, settings.train)
+        self._trained = trainable(backbone, settings.train)
 
     @property
     def members(self) -> int:
@@ -138,7 +142,7 @@ class TransformerReward:
         return combine(self.member_scores(candidates), self._settings.combine, self._fits)
 
     def features(self, candidates: Sequence[Response]) -> Floats:
-        """(N, d): what the heads see, the backbone's state at the last token."""
+        """(N, d): what the heads see, of a causal model its state at the last token."""
         found: Floats = self._in_chunks(candidates).numpy()
         return found
 
@@ -164,9 +168,11 @@ class TransformerReward:
         self._fits, self._temperature = int(state["fits"]), float(state["temperature"])
 
     @torch.no_grad()
-    def start_from(self, weight: Tensor) -> None:
+    def start_from(self, head: torch.nn.Linear) -> None:
         """Take over one head (1, d) that was fitted elsewhere, with its scores as they are."""
-        self._heads.copy_(weight)
+        self._heads.copy_(head.weight)
+        if head.bias is not None:
+            self._bias.copy_(head.bias)
         self._fits = 1
 
     @torch.no_grad()
@@ -177,8 +183,7 @@ class TransformerReward:
 
     @cached_property
     def _frozen(self) -> str:
-        named = dict(self.backbone.model.named_parameters())
-        return digest({n: p for n, p in named.items() if n not in self._trained and "pooler" not in n})
+        return digest({n: p for n, p in self.backbone.weights().items() if n not in self._trained})
 
     def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
         """(N, d) float32."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,21 @@ from transformers import (
     BertConfig,
     BertForSequenceClassification,
     BertModel,
+    BloomConfig,
+    BloomModel,
+    DebertaV2Config,
+    FNetConfig,
     GPT2Config,
     GPT2ForSequenceClassification,
+    GPTNeoConfig,
+    GPTNeoModel,
     OPTConfig,
     OPTModel,
     PreTrainedModel,
     PreTrainedTokenizerFast,
+    RobertaConfig,
+    XLMConfig,
+    XLNetConfig,
 )
 
 from prefrl.components import ConfigError
@@ -134,13 +142,15 @@ def test_checkpoints_that_are_no_reward_models_are_refused(toy_reviews: Reviews,
 
     gpt2(labels=2).save_pretrained(tmp_path / "two")
     gpt2().base_model.save_pretrained(tmp_path / "headless")
-    BertForSequenceClassification(bert_config(num_labels=1)).save_pretrained(tmp_path / "deep")
+    bert = BertForSequenceClassification(bert_config(num_labels=1))
+    kept = {name: p for name, p in bert.state_dict().items() if "pooler" not in name}
+    bert.save_pretrained(tmp_path / "unpooled", state_dict=kept)
     with pytest.raises(ConfigError, match="num_labels=1"):
         build(tmp_path / "two")
     with pytest.raises(ConfigError, match="weights are missing, score"):
         build(tmp_path / "headless")
-    with pytest.raises(ConfigError, match="without a linear head"):
-        build(tmp_path / "deep")
+    with pytest.raises(ConfigError, match=r"weights are missing, bert\.pooler"):
+        build(tmp_path / "unpooled")
     with pytest.raises(ConfigError, match=r"reward\.download"):
         build(tmp_path / "nothing")
 
@@ -178,10 +188,13 @@ def bert_config(**more: Any) -> BertConfig:
 def models() -> dict[str, Any]:
     torch.manual_seed(0)
     opt = OPTConfig(vocab_size=1000, ffn_dim=48, max_position_embeddings=64, word_embed_proj_dim=32, **SMALL)
-    return {"gpt2": gpt2().base_model, "opt": OPTModel(opt), "bert": BertModel(bert_config())}
+    bloom = BloomConfig(vocab_size=1000, hidden_size=32, n_layer=1, n_head=2)
+    neo = GPTNeoConfig(vocab_size=1000, hidden_size=32, num_layers=1, num_heads=2, attention_types=[[["local"], 1]])
+    causal = {"gpt2": gpt2().base_model, "opt": OPTModel(opt), "bloom": BloomModel(bloom), "gpt_neo": GPTNeoModel(neo)}
+    return causal | {"bert": BertModel(bert_config())}
 
 
-@pytest.mark.parametrize("kind", ["gpt2", "opt", "bert"])
+@pytest.mark.parametrize("kind", ["gpt2", "opt", "bloom", "bert"])
 def test_backbones_of_any_kind_score_alike_in_any_batch_and_come_back(
     toy_reviews: Reviews, tmp_path: Path, kind: str
 ) -> None:
@@ -204,37 +217,102 @@ def test_encoders_are_pooled_as_asked_and_not_exported(toy_reviews: Reviews, tmp
         save_classifier(mean, tmp_path / "out")
 
 
-def other_tokenizer(folder: Path, **special: Any) -> None:
-    from tokenizers import Tokenizer, models, pre_tokenizers
-
-    words = Tokenizer(models.WordLevel({"<e>": 0, "<u>": 1, "good": 2, "bad": 3, ".": 4}, unk_token="<u>"))
-    words.pre_tokenizer = pre_tokenizers.Whitespace()
-    tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, **special)  # type: ignore[no-untyped-call]
-    tokenizer.save_pretrained(folder)
-
-
-def test_another_tokenizer_reads_the_text_with_an_end_where_there_was_one(toy_reviews: Reviews, tmp_path: Path) -> None:
-    other_tokenizer(tmp_path, eos_token="<e>")
-    reward = own(toy_reviews, tmp_path, models()["gpt2"])
-    end = int(toy_reviews.tokenizer.eos_token_id)
-    ended, cut = (Response("good", "bad .", (7,), tokens) for tokens in ((9, 9, end), (9, 9)))
-    rows = reward.backbone.rows([ended, cut, Response("good", "bad ."), Response("good", "")])
-    assert rows == [[2, 3, 4, 0], [2, 3, 4], [2, 3, 4, 0], [2, 0]]
+@pytest.mark.parametrize("kind", ["bloom", "gpt_neo"])
+def test_backbones_with_attention_of_their_own_are_exported(toy_reviews: Reviews, tmp_path: Path, kind: str) -> None:
+    reward, probes = own(toy_reviews, tmp_path / "b", models()[kind]), some(toy_reviews, 8)
+    constant = save_classifier(reward, tmp_path / "c")
+    found = logits(tmp_path / "c", reward.backbone.rows(probes)) + constant
+    np.testing.assert_allclose(found, reward.member_scores(probes).mean(0), atol=1e-4)
 
 
-def test_a_tokenizer_without_an_end_is_refused(toy_reviews: Reviews, tmp_path: Path) -> None:
-    other_tokenizer(tmp_path)
-    reward = own(toy_reviews, tmp_path, models()["gpt2"])
-    with pytest.raises(ConfigError, match="neither an end token nor a separator"):
-        reward.score([Response("good", "bad")])
+def classifier(task: Reviews, folder: Path, config: Any, **tokenizer: Any) -> None:
+    """A checkpoint with weights that tell texts apart, its pooler's and head's included."""
+    torch.manual_seed(0)
+    model: Any = AutoModelForSequenceClassification.from_config(config)  # type: ignore[no-untyped-call]
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn(parameter.shape) * 0.2)
+    model.save_pretrained(folder)
+    save_tokenizer(task, folder, pad_token="<pad>", bos_token="<bos>", eos_token="<eos>", **tokenizer)
 
 
-def test_what_does_not_fit_the_context_is_named_with_both_lengths(toy_reviews: Reviews, tmp_path: Path) -> None:
-    reward, (one,) = own(toy_reviews, tmp_path, models()["gpt2"]), some(toy_reviews, 1)
-    long = replace(one, prompt_tokens=(5,) * 60, tokens=(5,) * 5)
-    for ask in (reward.stack, reward.score, reward.features):
-        with pytest.raises(ValueError, match=rf"candidate {long.id[:12]} has 65 tokens.* context of 64"):
-            ask([one, long])
+def encoders() -> dict[str, Any]:
+    more: dict[str, Any] = {"vocab_size": 1000, "intermediate_size": 48, "pad_token_id": 0, "num_labels": 1, **SMALL}
+    deberta: dict[str, Any] = {"relative_attention": True, "pos_att_type": ["c2p", "p2c"], "pooler_hidden_size": 32}
+    return {"bert": BertConfig(**more), "roberta": RobertaConfig(**more), "deberta": DebertaV2Config(**more, **deberta)}
+
+
+@pytest.mark.parametrize("kind", ["bert", "roberta", "deberta"])
+@pytest.mark.parametrize("train", ["full", "lora", "head"])
+def test_an_encoder_s_classifier_is_read_fitted_and_written_with_all_its_head(
+    toy_reviews: Reviews, tmp_path: Path, kind: str, train: Train
+) -> None:
+    classifier(toy_reviews, tmp_path / "a", encoders()[kind])
+    settings = TransformerSettings(checkpoint=str(tmp_path / "a"), members=1, train=train)
+    reward, probes = settings.build(toy_reviews, np.random.default_rng(0)), some(toy_reviews, 20)
+    rows, before = reward.backbone.rows(probes), reward.score(probes)
+    assert before.std() > 1e-3
+    np.testing.assert_allclose(before, logits(tmp_path / "a", rows), atol=1e-5)
+    np.testing.assert_allclose(before[:3], [logits(tmp_path / "a", [row])[0] for row in rows[:3]], atol=1e-5)
+    reward.scores(reward.stack(probes)).sum().backward()  # type: ignore[no-untyped-call]
+    with torch.no_grad():
+        for parameter in reward.parameters():
+            assert parameter.grad is not None
+            parameter.sub_(parameter.grad.sign() * 1e-3)
+    reward.settle(reward.stack(probes), no_loss)
+    assert save_classifier(reward, tmp_path / "out") == 0
+    assert np.abs(reward.score(probes) - before).max() > 0.1
+    np.testing.assert_allclose(logits(tmp_path / "out", rows), reward.score(probes), atol=1e-4)
+    again = settings.build(toy_reviews, np.random.default_rng(1))
+    again.load(reward.state())
+    assert again.score(probes).tobytes() == reward.score(probes).tobytes()
+
+
+def test_a_pooler_that_the_heads_see_is_part_of_what_is_frozen(toy_reviews: Reviews, tmp_path: Path) -> None:
+    classifier(toy_reviews, tmp_path, encoders()["bert"])
+    settings = TransformerSettings(checkpoint=str(tmp_path), members=1, train="head")
+    one, other = (settings.build(toy_reviews, np.random.default_rng(0)) for _ in range(2))
+    with torch.no_grad():
+        dict(other.backbone.model.named_parameters())["bert.pooler.dense.bias"].add_(1)
+    with pytest.raises(ValueError, match="frozen weights are others"):
+        other.load(one.state())
+
+
+def test_classifiers_whose_scores_are_no_linear_head_s_are_refused(toy_reviews: Reviews, tmp_path: Path) -> None:
+    size: dict[str, Any] = {"vocab_size": 1000, "num_labels": 1, "pad_token_id": 0}
+    bent = XLMConfig(emb_dim=32, n_layers=1, n_heads=2, summary_activation="tanh", **size)
+    mixing = FNetConfig(hidden_size=32, num_hidden_layers=1, intermediate_size=48, **size)
+    both_ways = XLNetConfig(d_model=32, n_layer=1, n_head=2, d_inner=48, **size)
+    wrong = {"hangs on padding, or is not": (bent, mixing), "XLNet.*: expected a causal": (both_ways,)}
+    for message, configs in wrong.items():
+        for config in configs:
+            folder = tmp_path / config.model_type
+            classifier(toy_reviews, folder, config)
+            with pytest.raises(ConfigError, match=message):
+                TransformerSettings(checkpoint=str(folder), members=1).build(toy_reviews, np.random.default_rng(0))
+
+
+CHAT = "{{ bos_token }}{% for m in messages %}{{ m.role }}: {{ m.content }}{{ eos_token }}{% endfor %}"
+
+
+def test_a_checkpoint_reads_by_its_chat_template_and_one_fitted_without_is_written_without(
+    toy_reviews: Reviews, tmp_path: Path
+) -> None:
+    classifier(toy_reviews, tmp_path / "a", gpt2().config, chat_template=CHAT)
+    probes, rows = some(toy_reviews, 4), []
+    for wanted in (None, False):
+        settings = TransformerSettings(checkpoint=str(tmp_path / "a"), members=1, chat_template=wanted)
+        reward = settings.build(toy_reviews, np.random.default_rng(0))
+        save_classifier(reward, tmp_path / str(wanted))
+        settings = TransformerSettings(checkpoint=str(tmp_path / str(wanted)), members=1)
+        again = settings.build(toy_reviews, np.random.default_rng(0))
+        rows.append(again.backbone.rows(probes))
+        assert again.backbone.rows(probes) == reward.backbone.rows(probes)
+        np.testing.assert_allclose(again.score(probes), reward.score(probes), atol=1e-5)
+    words = reward.backbone.tokenizer
+    expected = [f"<bos>user: {p.prompt}<eos>assistant: {p.text}<eos>" for p in probes]
+    assert rows[0] == [words.encode(text, add_special_tokens=False) for text in expected]
+    assert rows[1] == [[*p.prompt_tokens, *p.tokens] for p in probes]
 
 
 def test_adapters_are_all_that_is_saved_of_a_backbone(toy_reviews: Reviews) -> None:
