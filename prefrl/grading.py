@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy.special import log_expit, logsumexp
 
 from prefrl.components import Settings
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, labeler_part, member_part
@@ -31,16 +30,37 @@ from prefrl.evaluate.invariance import self_test
 from prefrl.evaluate.lengths import context, length, length_part, sample
 from prefrl.evaluate.summary import read_metrics
 from prefrl.files import DamagedError
-from prefrl.fit.metrics import brier, calibration_error, temperature
+from prefrl.fit.metrics import Answering, brier, calibration_error, log_losses, temperature
+from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import split
+from prefrl.fit.terms import Ties
 from prefrl.graph import batch
 from prefrl.protocols import RewardModel, Store
-from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score
+from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score, person
 
 DRAWN = 300
 """Candidates in a scatter plot."""
 HALF = 10
 """Comparisons that a temperature is fitted on, at least."""
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How labelers answer, as the fit of a model assumed and found."""
+
+    fitting: FittingSettings = field(default_factory=FittingSettings)
+    tie: float | None = None
+    """The tie parameter in the members' mean, where ties were modelled."""
+    error_rates: Mapping[str, float] = field(default_factory=dict)
+    """By labeler, where the fit estimated them."""
+
+    def answering(self, labelers: Sequence[str]) -> Answering:
+        """Of the labeler of each comparison (M,)."""
+        ties: Ties = "half" if self.tie is None else self.fitting.ties
+        share = 1 / 2 if ties == "half" else 2 / 3
+        assumed = self.fitting.error_rate * share
+        error = [self.error_rates.get(name, assumed) for name in labelers]
+        return Answering(ties, self.tie or 0.0, np.array(error))
 
 
 @dataclass(frozen=True)
@@ -59,8 +79,7 @@ class Subject:
     round: int | None = None
     probes: Sequence[dict[str, Any]] = ()
     """Rows of `probes.jsonl`."""
-    error_rates: Mapping[str, float] = field(default_factory=dict)
-    """By labeler, where the fit estimated them."""
+    habits: Habits = field(default_factory=Habits)
 
 
 def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
@@ -83,11 +102,13 @@ def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
         about=_about(subject, pairs, candidates),
         accuracy=pairs.accuracy(rng),
         by_margin=buckets(pairs, pairs.margin, rng),
-        calibration=_calibration(pairs, rng),
+        calibration=_calibration(pairs, subject.habits.answering(pairs.labeler.tolist()), rng),
         lengths=length_part(pairs, score, candidates, rng),
         gold=_gold(pairs, score, candidates, rng),
         distance=distance_part(subject.reward, candidates, subject.known, subject.discount, rng),
-        labelers=[labeler_part(pairs, n, subject.error_rates.get(n), rng) for n in np.unique(pairs.labeler).tolist()],
+        labelers=[
+            labeler_part(pairs, n, subject.habits.error_rates.get(n), rng) for n in np.unique(pairs.labeler).tolist()
+        ],
         members=member_part(pairs.decided, rng),
         invariance=self_test(subject.reward.raw_member_scores, candidates, [(int(a), int(b)) for a, b in data.edges]),
         drift=drift(subject.probes),
@@ -97,12 +118,12 @@ def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
 
 
 def of_run(
-    reward: RewardModel[Any], store: Store[Any], folder: Path, round: int, held_out: float, discount: float
+    reward: RewardModel[Any], store: Store[Any], folder: Path, round: int, fitting: FittingSettings, discount: float
 ) -> Subject | None:
     """A run's reward model on what its newest fit left out; None where there is nothing to grade, or to grade on."""
     rows = [row for row in read_metrics(folder) if row["round"] <= round]
     snapshot = next((row["fit/snapshot"] for row in reversed(rows) if row.get("fit/snapshot") is not None), 0)
-    judged = judgements(store, held_out, int(snapshot))
+    judged = judgements(store, fitting.held_out, int(snapshot))
     if not reward.fitted or all(len(one.query.candidates) < 2 for one in judged):
         return None
     return Subject(
@@ -115,7 +136,7 @@ def of_run(
         held_out=True,
         round=round,
         probes=[row for row in read_probes(folder) if row["round"] <= round],
-        error_rates=error_rates(rows),
+        habits=habits(fitting, rows),
     )
 
 
@@ -151,11 +172,12 @@ def _segments(judged: Sequence[Judged[Any]]) -> list[Segment]:
     return [c for c in found.values() if isinstance(c, Segment)]
 
 
-def error_rates(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """By labeler, of the newest fit in the rows of `metrics.jsonl` that estimated them."""
+def habits(fitting: FittingSettings, rows: Sequence[Mapping[str, Any]]) -> Habits:
+    """As the newest fit in the rows of `metrics.jsonl` found them."""
+    found: Mapping[str, Any] = next((row for row in reversed(rows) if row.get("fit/loss") is not None), {})
     mark = "fit/error_rate/"
-    found = [{k.removeprefix(mark): v for k, v in row.items() if k.startswith(mark) and v is not None} for row in rows]
-    return next((rates for rates in reversed(found) if rates), {})
+    rates = {k.removeprefix(mark): v for k, v in found.items() if k.startswith(mark) and v is not None}
+    return Habits(fitting, found.get("fit/tie"), rates)
 
 
 def _finite(raw: Floats, candidates: Sequence[Candidate]) -> Floats:
@@ -179,7 +201,7 @@ def _pairs(subject: Subject, data: Any, raw: Floats) -> Pairs:
         preference=data.preference.astype(np.float64),
         gold=gold[first] - gold[second],
         length=lengths[first] - lengths[second],
-        labeler=np.array([one.judgement.labeler for one in subject.judged])[data.group],
+        labeler=np.array([person(one.judgement.labeler) for one in subject.judged])[data.group],
         cluster=cluster,
         clusters=sense,
     )
@@ -205,20 +227,21 @@ def _about(subject: Subject, pairs: Pairs, candidates: Sequence[Candidate]) -> A
     )
 
 
-def _calibration(pairs: Pairs, rng: np.random.Generator) -> Calibration:
-    p, y = pairs.predicted, pairs.preference
-    half = _halves(pairs, rng)
-    found = [temperature(pairs.logits[:, half != own], y[half != own]) for own in (0, 1)] if len(half) else []
-    after = replace(pairs, logits=pairs.logits / np.array(found)[half]) if found else pairs
+def _calibration(pairs: Pairs, answering: Answering, rng: np.random.Generator) -> Calibration:
+    """Of the answers, not of what is felt: ties and mistakes are in them."""
+    p, y, half = answering.expected(pairs.logits), pairs.preference, _halves(pairs, rng)
+    others = [np.flatnonzero(half != own) for own in (0, 1)] if len(half) else []
+    found = [temperature(pairs.logits[:, at], y[at], answering.of(at)) for at in others]
+    cooled = pairs.logits / np.array(found)[half] if found else pairs.logits
     too_few = undefined(f"fewer than {2 * HALF} comparisons, or all of them hang together")
     return Calibration(
-        log_loss=_measured(log_loss(pairs.logits, y), y),
+        log_loss=_measured(log_losses(pairs.logits, y, answering).mean(), y),
         brier=_measured(brier(p, y), y),
         error=_measured(calibration_error(p, y), y),
         bins=[ReliabilityBin(**vars(b)) for b in reliability(p, y)],
         temperatures=found,
-        log_loss_after=_measured(log_loss(after.logits, y), y) if found else too_few,
-        error_after=_measured(calibration_error(after.predicted, y), y) if found else too_few,
+        log_loss_after=_measured(log_losses(cooled, y, answering).mean(), y) if found else too_few,
+        error_after=_measured(calibration_error(answering.expected(cooled), y), y) if found else too_few,
     )
 
 
@@ -227,12 +250,6 @@ def _halves(pairs: Pairs, rng: np.random.Generator) -> Integers:
     names, at = np.unique(pairs.cluster, return_inverse=True)
     half = (rng.permutation(len(names)) % 2)[at]
     return half if min(np.bincount(half, minlength=2)) >= HALF else half[:0]
-
-
-def log_loss(logits: Floats, preference: Floats) -> float:
-    """Mean negative log-likelihood of preferences (M,) by the mean of the members' probabilities, in nats."""
-    log_p, log_q = (logsumexp(log_expit(sign * logits), axis=0) - np.log(len(logits)) for sign in (1, -1))
-    return -float((preference * log_p + (1 - preference) * log_q).mean())
 
 
 def _measured(value: float, rows: Floats) -> Estimate:

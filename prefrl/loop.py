@@ -18,7 +18,7 @@ from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import NothingToFit, fit
 from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
 from prefrl.seeding import Streams, streams
-from prefrl.types import C, Evaluation, Fitted, Metrics, Round
+from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
 
 class LoopSettings(Settings):
@@ -67,6 +67,8 @@ class Loop(Generic[C]):
     seed: int = 0
     round: int = -1
     """The last round that is done; 0 is the evaluation of the starting policy, -1 is nothing yet."""
+    sequence: int = 0
+    """The store's newest event when that round was done: a round that is done again asks the same."""
     stage: str = "start"
     """What is going on, for whoever watches."""
     _seconds: Metrics = field(default_factory=dict)
@@ -106,20 +108,31 @@ class Loop(Generic[C]):
         with self._timed("sample"):
             pool = self.learner.sample(int(count * self.candidates * self.settings.pool), rng.sample)
             queries = self.selector.select(pool, self.reward, count, rng.select)
-            if len(queries) < count:
-                self._note_shortage(len(queries), count, len(pool))
+            if not queries:
+                raise ValueError(
+                    f"{len(pool)} sampled candidates gave 0 of {count} queries of {self.candidates}: raise loop.pool, "
+                    f"now {self.settings.pool}, or let the learner sample more that can be compared (for text "
+                    "learner.asked_responses, for control shorter segments)"
+                )
+            queries = self._new(queries, pool, count, rng)
             self.store.ask(queries)
+            if len(queries) < count:
+                self._notes.append(
+                    f"{len(pool)} sampled candidates gave {len(queries)} of {count} new queries of {self.candidates}"
+                )
             return pool
 
-    def _note_shortage(self, found: int, wanted: int, pool: int) -> None:
-        """A pool may hold too few candidates that can be compared; none at all is a mistake in the settings."""
-        text = f"{pool} sampled candidates gave {found} of {wanted} queries of {self.candidates}"
-        if not found:
-            raise ValueError(
-                f"{text}: raise loop.pool (now {self.settings.pool}), or let the learner sample more that can be "
-                "compared (for text learner.asked_responses, for control shorter segments)"
-            )
-        self._notes.append(text)
+    def _new(self, queries: list[Query[C]], pool: list[C], count: int, rng: Streams) -> list[Query[C]]:
+        """Without those that were asked in rounds before: a policy may repeat itself. Others of the pool stand in."""
+        known = self.store.asked_before([query.id for query in queries], self.sequence)
+        if not known:
+            return queries
+        new = [query for query in queries if query.id not in known]
+        used = {candidate.id for query in new for candidate in query.candidates}
+        used |= self.store.asked_before([c.id for c in pool], self.sequence)
+        return new + self.selector.select(
+            [c for c in pool if c.id not in used], self.reward, count - len(new), rng.select
+        )
 
     def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
         with self._timed("fit"):
@@ -150,6 +163,7 @@ class Loop(Generic[C]):
         if not self.reward.fitted:
             stages["evaluate"].pop("learned", None)  # what an unfitted network says means nothing
         notes = tuple(self._notes)
+        self.sequence = self.store.sequence
         self.round, self._seconds, self._notes, self.stage = number, {}, [], "idle"
         metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
         return Round(number, metrics, evaluated.examples, fitted, notes)

@@ -178,6 +178,9 @@ class Store(Protocol[C]):
     def counts(self) -> dict[str, int]:
         """Queries asked, answered, skipped."""
 
+    def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
+        """Which of these queries and candidates had been asked about by then."""
+
 
 class RewardModel(Protocol[C_contra]):
     """What is fitted. One network is an ensemble of E = 1; members are evaluated in one batched pass."""

@@ -26,7 +26,7 @@ from prefrl.loop import Loop
 from prefrl.protocols import Attended, RewardModel, Task
 from prefrl.seeding import streams
 from prefrl.store import Store
-from prefrl.types import Round
+from prefrl.types import Fitted, Round
 
 KEEP = 2
 """Checkpoints kept: if the newest is damaged, the one before it serves."""
@@ -97,7 +97,7 @@ class Run:
         """Grade the reward model where judgements were held out, write `report.html`, and say where it is."""
         settings = self.config
         reward, discount = self.loop.reward, discount_of(settings.learner)
-        subject = of_run(reward, self.store, self.folder, self.loop.round, settings.fitting.held_out, discount)
+        subject = of_run(reward, self.store, self.folder, self.loop.round, settings.fitting, discount)
         if subject is not None:
             card = grade(subject, streams(settings.seed, 0).evaluate)
             write_file(self.folder / "card.json", card.model_dump_json(indent=1).encode())
@@ -157,7 +157,7 @@ class Run:
             save_state(folder, "learner", self.loop.learner.state())
             save_state(folder, "reward", self.loop.reward.state())
             write_file(folder / "config.yaml", self.config.dump().encode())
-            write_file(folder / "loop.json", json.dumps({"round": number, "store": self.store.sequence}).encode())
+            write_file(folder / "loop.json", json.dumps({"round": number, "store": self.loop.sequence}).encode())
         for old in _checkpoints(self.folder)[KEEP:]:
             shutil.rmtree(old)
 
@@ -174,7 +174,8 @@ class Run:
         self.notes += damaged
         self.loop.learner.load(load_state(folder, "learner"))
         self.loop.reward.load(load_state(folder, "reward"))
-        self.loop.round = json.loads((folder / "loop.json").read_text())["round"]
+        found = json.loads((folder / "loop.json").read_text())
+        self.loop.round, self.loop.sequence = found["round"], found["store"]
         self.notes.append(f"going on after round {self.loop.round}")
         return [row for row in read_metrics(self.folder) if row["round"] <= self.loop.round]
 
@@ -201,9 +202,12 @@ def open_saved(path: str | Path) -> Saved:
     return Saved(saved_config(folder), folder)
 
 
-def save_reward(folder: Path, config: Config, reward: RewardModel[Any]) -> None:
-    """Write a reward model with the settings that can build it again."""
+def save_reward(folder: Path, config: Config, reward: RewardModel[Any], fitted: Fitted | None = None) -> None:
+    """Write a reward model with the settings that can build it again, and what its fit came to (`fit.json`)."""
     with whole_folder(folder) as work:
+        if fitted is not None:
+            metrics = {f"fit/{k}": v if math.isfinite(v) else None for k, v in fitted.metrics.items()}
+            write_file(work / "fit.json", json.dumps(metrics, indent=1).encode())
         save_state(work, "reward", reward.state())
         write_file(work / "config.yaml", config.dump().encode())
 

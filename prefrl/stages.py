@@ -17,9 +17,10 @@ from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.report import render_card
+from prefrl.evaluate.summary import read_metrics
 from prefrl.files import check_free, read_lines, write_file
 from prefrl.fit.trainer import fit
-from prefrl.grading import Subject, discount_of, grade, judgements, of_run
+from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.graph import batch
 from prefrl.label.formats import Which
 from prefrl.label.source import open_judgements
@@ -146,9 +147,13 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
     settings: Any = config
     rng, task = streams(config.seed, 1), settings.task.build()
     with open_judgements(source, task, which) as (store, notes):
+        if config.fitting.pseudo_labels and not store.open_queries():
+            raise ConfigError(
+                f"fitting.pseudo_labels: {source} holds no query without a judgement to label; set it to 0"
+            )
         reward = settings.reward.build(task, rng.build)
         fitted = fit(reward, store, config.fitting, rng.fit)
-    save_reward(out, config, reward)
+    save_reward(out, config, reward, fitted)
     return fitted, notes
 
 
@@ -200,7 +205,7 @@ def report_card(
     """
     saved = open_saved(model)
     settings: Any = saved.config
-    task, share, rng = settings.task.build(), settings.fitting.held_out, streams(settings.seed, 0).evaluate
+    task, fitting, rng = settings.task.build(), settings.fitting, streams(settings.seed, 0).evaluate
     reward, discount = saved.reward(task), discount_of(settings.learner)
     source = data or model
     if data is None and not (model / "checkpoints").exists():
@@ -208,17 +213,25 @@ def report_card(
     with open_judgements(source, task, which) as (store, _):
         if data is None:
             round = json.loads((saved.folder / "loop.json").read_text())["round"]
-            subject = of_run(reward, store, model, round, share, discount)
+            subject = of_run(reward, store, model, round, fitting, discount)
         else:
-            judged = judgements(store, share if held_out else None)
-            subject = (
-                Subject(reward, judged, (), discount, model.resolve().name, source.name, held_out) if judged else None
+            judged, names = (
+                judgements(store, fitting.held_out if held_out else None),
+                (model.resolve().name, source.name),
             )
+            known = habits(fitting, _fits(model))
+            subject = Subject(reward, judged, (), discount, *names, held_out, habits=known) if judged else None
         if subject is None:
             raise RunError(f"{source}: no judgement is held out that the reward model could be graded on")
         if rewardbench is not None:
             _write_rewardbench(subject, rewardbench)
         return grade(subject, rng)
+
+
+def _fits(model: Path) -> list[dict[str, Any]]:
+    """What the fits of a run, or the one of a saved reward model, came to."""
+    alone = model / "fit.json"
+    return [json.loads(alone.read_text())] if alone.exists() else read_metrics(model)
 
 
 def _write_rewardbench(subject: Subject, folder: Path) -> None:

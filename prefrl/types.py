@@ -192,6 +192,12 @@ class Rating:
             raise ValueError(f"a rating needs levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}")
 
 
+def person(labeler: str) -> str:
+    """Who gave a judgement: NAME, also of NAME#2, which is their second answer to a question in one file."""
+    name, mark, number = labeler.rpartition("#")
+    return name if name and mark and number.isdigit() else labeler
+
+
 @dataclass(frozen=True)
 class Skip:
     """No judgement. A skip may be asked again of someone else; incomparable says that there is no answer."""

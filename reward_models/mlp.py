@@ -70,8 +70,4 @@ class MLP:
         """(E, S, I) -> (E, S): each member with inputs of its own."""
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = self._activation(torch.baddbmm(bias, x, weight))
-        weight, bias = self.weights[-1], self.biases[-1]
-        if self.members == 1:
-            return torch.baddbmm(bias, x, weight)[:, :, 0]
-        # For several members a row times a matrix is several times faster than a matrix times a column.
-        return torch.baddbmm(bias, weight.transpose(1, 2), x.transpose(1, 2))[:, 0]
+        return torch.baddbmm(self.biases[-1], x, self.weights[-1])[:, :, 0]

@@ -1,6 +1,7 @@
 """The report card of a reward model that is known by heart."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from linear_reward import LinearReward, segment
 
 from prefrl.evaluate.card import ReportCard
 from prefrl.fit.metrics import accuracy, brier, calibration_error
-from prefrl.grading import Subject, error_rates, grade, judgements, log_loss
+from prefrl.fit.settings import FittingSettings
+from prefrl.grading import Habits, Subject, grade, habits, judgements
 from prefrl.graph import batch
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response, Segment, gold_score
@@ -72,8 +74,21 @@ def test_a_model_that_is_too_sure_is_found_out_and_mended_on_the_other_half(rng:
     assert after < before - 0.1
 
 
-def test_log_loss_is_finite_however_sure_a_model_is() -> None:
-    assert log_loss(np.array([[1000.0, -1000.0]]), np.array([1.0, 1.0])) == 500.0
+def test_a_fit_that_knows_of_mistakes_and_ties_is_not_blamed_for_them(rng: np.random.Generator) -> None:
+    some = judged(1500, rng, ("ann", "bob"))
+    turned = []
+    for one in some:
+        assert isinstance(one.judgement, Comparison)
+        wrong = one.judgement.labeler == "bob" and rng.random() < 0.4
+        said = abs(one.judgement.preference - wrong)
+        turned.append(Judged(one.query, replace(one.judgement, preference=said)))
+    reward = LinearReward(WEIGHTS, WEIGHTS)
+    blamed = grade(Subject(reward, turned), rng).calibration
+    known = grade(Subject(reward, turned, habits=Habits(error_rates={"ann": 0.0, "bob": 0.4})), rng).calibration
+    assert blamed.error.value is not None
+    assert known.error.value is not None
+    assert known.error.value < 0.04 < 0.08 < blamed.error.value
+    assert known.temperatures == pytest.approx([1.0, 1.0], abs=0.35)
 
 
 def test_a_reward_for_length_is_found_out(rng: np.random.Generator) -> None:
@@ -135,11 +150,16 @@ def test_gold_comes_from_the_store_where_it_lies_there(store: Store[Segment], rn
         judgements(store)
 
 
-def test_error_rates_are_those_of_the_newest_fit_that_has_them() -> None:
+def test_habits_are_those_of_the_newest_fit() -> None:
     rows: list[dict[str, float]] = [
-        {"fit/error_rate/ann": 0.3, "round": 1},
+        {"fit/error_rate/ann": 0.3, "fit/tie": 0.4, "fit/loss": 2, "round": 1},
         {"fit/error_rate/ann": 0.1, "fit/loss": 1},
         {"round": 3},
     ]
-    assert error_rates(rows) == {"ann": 0.1}
-    assert error_rates([]) == {}
+    found = habits(FittingSettings(ties="davidson", error_rate=0.2), rows)
+    assert (found.error_rates, found.tie) == ({"ann": 0.1}, None)
+    assert found.answering(["ann", "eve"]).error.tolist() == [0.1, 0.1]  # type: ignore[union-attr]
+    before = habits(FittingSettings(ties="davidson", error_rate=0.3), rows[:1]).answering(["ann", "eve"])
+    assert (before.ties, before.tie) == ("davidson", 0.4)
+    assert before.error.tolist() == pytest.approx([0.3, 0.2])  # type: ignore[union-attr]
+    assert habits(FittingSettings(), []).error_rates == {}

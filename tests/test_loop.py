@@ -1,6 +1,6 @@
 """The loop end to end on the toy presets: every claim holds for control and for text."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import Store
 from prefrl.stages import shrink
 from prefrl.store import Store as SQLStore
-from prefrl.types import Answer, Comparison, Ranking, Skip
+from prefrl.types import Answer, Comparison, Query, Ranking, Skip
 
 TOYS = ["control/toy", "text/toy"]
 
@@ -207,6 +207,35 @@ def test_a_pool_that_is_too_small_is_noted_and_none_at_all_says_what_to_change(s
     _, first, *_ = loop.run()
     assert "8 sampled candidates gave" in first.notes[0]
     assert 0 < first.metrics["label/asked"] <= 4
+
+
+def test_what_was_asked_before_is_not_asked_again_and_a_round_done_again_asks_the_same(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path, "loop.labels=8", "loop.rounds=4", "loop.first_share=0.25")
+    pool = list({c.episode: c for c in loop.learner.sample(200, np.random.default_rng(0))}.values())[:13]
+
+    class Stubborn(Blind):
+        """Does the same each time."""
+
+        def sample(self, count: int, rng: np.random.Generator) -> list[Any]:
+            return pool
+
+    class InOrder:
+        def select(self, pool: Sequence[Any], reward: Any, count: int, rng: np.random.Generator) -> list[Query[Any]]:
+            return [Query(pair) for pair in zip(pool[::2], pool[1::2], strict=False)][:count]
+
+    loop.learner, loop.selector = Stubborn(loop.learner), InOrder()
+    loop.start()
+    asked, notes = [], []
+    for _ in range(4):
+        done, sequence = loop.round, loop.sequence
+        first = loop.step().metrics["label/asked"]
+        loop.round, loop.sequence = done, sequence  # as after a kill
+        again = loop.step()
+        asked.append(again.metrics["label/asked"])
+        assert first == asked[-1]
+        notes.append(again.notes)
+    assert asked == [2, 4, 6, 6]
+    assert "13 sampled candidates gave 0 of 2 new queries of 2" in notes[-1]
 
 
 def test_labels_are_spread_as_the_settings_say() -> None:

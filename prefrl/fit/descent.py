@@ -83,7 +83,8 @@ class Problem(Generic[C]):
     def _unjudged(self, part: Terms, order: torch.Generator) -> Tensor:
         if not self.fitting.pseudo_labels:
             return torch.zeros(0, 2, dtype=torch.int64)
-        count = UNJUDGED * len(part.choices.judgement)
+        judgements = torch.cat([part.choices.judgement, part.ratings.judgement])
+        count = UNJUDGED * len(set(judgements.tolist()))
         return semi.pairs(self.candidates[self.judged :], self.judged, count, order)
 
 

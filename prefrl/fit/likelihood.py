@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from prefrl.fit import losses
+from prefrl.fit.metrics import Answering
 from prefrl.fit.terms import Choices, Ratings, Terms, Ties
 from prefrl.types import Floats, Metrics
 
@@ -57,22 +58,25 @@ class Likelihood:
         """What was learned beside the reward, as means over members."""
         found = {}
         if self.tie.requires_grad:
-            natural = torch.nn.functional.softplus if self._ties == "rao_kupper" else torch.exp
-            found["tie"] = float(natural(self.tie.detach()).mean())
+            found["tie"] = float(self._natural_tie().mean())
         if self.errors.requires_grad:
             rates = self.errors.detach().sigmoid().mean(0).tolist()
             found |= {f"error_rate/{name}": rate for name, rate in zip(self._labelers, rates, strict=True)}
         return found
 
-    def pair_errors(self, terms: Terms) -> Floats:
-        """(J,) the probability, in the members' mean, that a judgement of two is not what the scores say."""
-        rates = (
-            self.errors.detach().sigmoid()
-            if self.errors.requires_grad
-            else torch.full_like(self.errors, self._error_rate / 2)
+    def answering(self, terms: Terms) -> Answering:
+        """How scores become answers of two, with the error of each judgement (J,) in the members' mean."""
+        tie: Floats | float = self._natural_tie().double().numpy()[:, None] if self.tie.requires_grad else 0.0
+        outcomes = 2 if self._ties == "half" else 3
+        blind = torch.tensor(self._error_rate * (outcomes - 1) / outcomes)
+        rates = self.errors.detach().sigmoid() if self.errors.requires_grad else blind.expand_as(self.errors)
+        return Answering(self._ties, tie, rates.mean(0)[terms.labeler].double().numpy())
+
+    def _natural_tie(self) -> Tensor:
+        """(E,) nu, or the threshold."""
+        return (
+            torch.nn.functional.softplus(self.tie.detach()) if self._ties == "rao_kupper" else self.tie.detach().exp()
         )
-        found: Floats = rates.mean(0)[terms.labeler].double().numpy()
-        return found
 
     def thresholds(self) -> Tensor:
         """(E, levels - 1), increasing."""
@@ -82,11 +86,16 @@ class Likelihood:
         found = scores[:, rows.items]
         if not rows.pairs:
             found = found.masked_fill(~rows.present, -torch.inf)
-        error = self._error(labeler[rows.judgement], rows.present.sum(1))
+        error = self._error(labeler[rows.judgement], self._outcomes(rows))
         if self._ties == "half":
             return losses.choice(found, rows.target, error)
         of_ties = losses.davidson if self._ties == "davidson" else losses.rao_kupper
         return of_ties(found, rows.target, rows.tied, self.tie, error)
+
+    def _outcomes(self, rows: Choices) -> Tensor:
+        """(S,) how many answers a choice could get: one for each candidate, and with ties for each set of them."""
+        candidates = rows.present.sum(1)
+        return candidates if self._ties == "half" else 2**candidates - 1
 
     def _ratings(self, rows: Ratings, scores: Tensor, labeler: Tensor) -> Tensor:
         levels = torch.tensor(self.thresholds().shape[1] + 1)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.special import expit
+from scipy.special import log_expit, logsumexp
 
-from prefrl.types import Floats
+from prefrl.types import Floats, Integers
+
+if TYPE_CHECKING:
+    from prefrl.fit.terms import Ties
 
 HOTTEST = 10.0
 CERTAINTY = 0.5
@@ -42,19 +47,61 @@ def calibration_error(predicted: Floats, preference: Floats, bins: int = 10) -> 
     return float(sum(gaps))
 
 
-def temperature(logits: Floats, preference: Floats, error: Floats | float = 0.0, weight: Floats | float = 1.0) -> float:
+@dataclass(frozen=True, eq=False)
+class Answering:
+    """How what is felt becomes an answer: which differences are called a tie, and how often it is another answer."""
+
+    ties: Ties = "half"
+    tie: Floats | float = 0.0
+    """nu (Davidson) or the threshold (Rao and Kupper); one for all members, or one for each (E, 1)."""
+    error: Floats | float = 0.0
+    """(M,) how often an answer is one of the others, see `losses.with_errors`."""
+
+    def of(self, at: Integers) -> Answering:
+        """The same for the comparisons at these places."""
+        return replace(self, error=self.error[at] if isinstance(self.error, np.ndarray) else self.error)
+
+    def expected(self, logits: Floats) -> Floats:
+        """(E, M) logits -> (M,) the preference that is expected: P(first) + P(tie) / 2, in the members' mean."""
+        found: Floats = np.exp(self.log_expected(logits))
+        return found
+
+    def log_expected(self, logits: Floats) -> Floats:
+        """Its logarithm, finite however sure the members are."""
+        felt = logsumexp(self._log_felt(logits), axis=0) - math.log(len(logits))
+        outcomes = 2 if self.ties == "half" else 3
+        blind = self.error * outcomes / (outcomes - 1) * np.ones(len(felt))
+        p = np.exp(felt)
+        found: Floats = np.where(blind == 0, felt, np.log(np.maximum(p + blind * (0.5 - p), np.finfo(np.float64).tiny)))
+        return found
+
+    def _log_felt(self, logits: Floats) -> Floats:
+        if self.ties == "rao_kupper":
+            wins, loses = log_expit(logits - self.tie), log_expit(-logits - self.tie)
+            tied: Floats = np.logaddexp(wins, wins + loses + np.log(np.expm1(2 * self.tie) / 2))
+            return tied
+        if self.ties == "half":
+            felt: Floats = log_expit(logits)
+            return felt
+        first, tie = logits / 2, np.log(self.tie)
+        norm = np.logaddexp(np.logaddexp(first, -first), tie)
+        davidson: Floats = np.logaddexp(first, tie - math.log(2)) - norm
+        return davidson
+
+
+def temperature(
+    logits: Floats, preference: Floats, answering: Answering | None = None, weight: Floats | float = 1.0
+) -> float:
     """What to divide logits (E, M) by, so that the members' mean probability fits preferences (M,) best.
 
     Guo et al. 2017, section 4.2, with a normal prior on log T about 0: a few comparisons cannot say much. 1 for none.
-    `error`: the probability (M,) that an answer is turned round, see `judged_probability`; `weight`: how much each
-    comparison counts, which matters beside the prior.
+    `weight`: how much each comparison counts, which matters beside the prior.
     """
+    answering = answering or Answering()
 
     def loss(log_t: float) -> float:
-        p = judged_probability(expit(logits / math.exp(log_t)).mean(0), error)
-        p = np.clip(p, 1e-12, 1 - 1e-12)
-        likelihood = preference * np.log(p) + (1 - preference) * np.log(1 - p)
-        return float((log_t / CERTAINTY) ** 2 / 2 - (weight * likelihood).sum())
+        cooled = logits / math.exp(log_t)
+        return float((log_t / CERTAINTY) ** 2 / 2 + (weight * log_losses(cooled, preference, answering)).sum())
 
     if not len(preference):
         return 1.0
@@ -62,6 +109,7 @@ def temperature(logits: Floats, preference: Floats, error: Floats | float = 0.0,
     return math.exp(float(minimize_scalar(loss, bounds=(-bound, bound), method="bounded").x))
 
 
-def judged_probability(predicted: Floats, error: Floats | float) -> Floats:
-    """(M,) the probability that the first is judged better, by a labeler who turns what they see round by mistake."""
-    return error + (1 - 2 * error) * predicted
+def log_losses(logits: Floats, preference: Floats, answering: Answering) -> Floats:
+    """(M,) negative log-likelihoods of preferences (M,) by the mean of the members' probabilities, in nats."""
+    log_p, log_q = (answering.log_expected(sign * logits) for sign in (1, -1))
+    return -(preference * log_p + (1 - preference) * log_q)

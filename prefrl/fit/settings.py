@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from prefrl.components import Settings
 from prefrl.fit.likelihood import Reliability
@@ -48,3 +48,11 @@ class FittingSettings(Settings):
     """How sure it must be."""
     crop: float = Field(0.0, ge=0, lt=1)
     """The most of a segment that is cut away at random in each gradient step (SURF); 0 for none."""
+
+    @model_validator(mode="after")
+    def _measured(self) -> Self:
+        """What hangs on held-out judgements needs some."""
+        if not self.held_out and (self.patience or self.weight_decay == "adaptive"):
+            name = "patience" if self.patience else "weight_decay=adaptive"
+            raise ValueError(f"{name} needs held-out judgements, and held_out is 0; set held_out=0.15, say")
+        return self

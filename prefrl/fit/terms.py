@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from prefrl.graph import implied_pairs
-from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating
+from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating, person
 
 Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
 MOST_TIED = 10
@@ -137,14 +137,17 @@ def terms(judged: Sequence[Judged[C]], ids: Sequence[str], ties: Ties, rankings:
         raise ValueError(
             f"a ranking ties more than {MOST_TIED} candidates, and has too many orders: set rankings=pairs"
         )
-    if ties == "davidson" and any(len(one.query.candidates) > MOST_TIED for one in judged):
+    if ties == "davidson" and any(
+        isinstance(j.judgement, wide) and len(j.query.candidates) > MOST_TIED for j in judged
+    ):
         raise ValueError(f"ties=davidson weighs all sets of candidates, of at most {MOST_TIED}: set ties=half")
-    names = tuple(dict.fromkeys(one.judgement.labeler for one in judged))
+    people = [person(one.judgement.labeler) for one in judged]
+    names = tuple(dict.fromkeys(people))
     numbers = {name: i for i, name in enumerate(names)}
     return Terms(
         choices=_choices(judged, index, ties, rankings),
         ratings=_ratings(judged, index),
-        labeler=torch.tensor([numbers[one.judgement.labeler] for one in judged]),
+        labeler=torch.tensor([numbers[name] for name in people]),
         labelers=names,
         scale=scales[0] if scales else 0,
     )

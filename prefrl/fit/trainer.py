@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.special import expit
 from torch import Tensor
 
 from prefrl.fit.descent import Problem, all_scores, ensemble_loss, optimise, trainable
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.losses import preference_logits
-from prefrl.fit.metrics import accuracy, brier, calibration_error, judged_probability, temperature
+from prefrl.fit.metrics import accuracy, brier, calibration_error, temperature
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
@@ -59,10 +60,13 @@ def fit_judged(
         raise NothingToFit(f"all {len(judged)} judgements are ties; expected at least one that prefers a candidate")
     data, held_out = batch(judged), split(judged, fitting.held_out)
     problem = _problem(reward, judged, held_out, fitting, unjudged, rng)
+    if not trainable(reward):
+        _check_inputs(problem)
     try:
         epochs = optimise(problem, rng)
     except FloatingPointError:
         _check_finite(all_scores(reward, problem.stacked), problem.candidates)
+        _check_inputs(problem)
         raise
     scores = reward.settle(problem.stacked, problem.total)
     _check_finite(scores, problem.candidates)
@@ -100,22 +104,22 @@ def _problem(
 
 def _finish(problem: Problem[C], data: Batch[C], out: np.ndarray, scores: Tensor, epochs: int) -> Fitted:
     """Measure a fit, and calibrate the model."""
-    test, errors = data.subset(out), problem.likelihood.pair_errors(problem.every)
-    logits = preference_logits(scores, test.edges).double().numpy()
-    heat = temperature(logits, test.preference, errors[test.group], test.weight)
+    test, logits = data.subset(out), _logits(scores, data.subset(out))
+    answering = problem.likelihood.answering(problem.every)
+    heat = temperature(logits, test.preference, answering.of(test.group), test.weight)
     problem.reward.calibrate(heat)
     metrics = {
         "judgements": float(len(problem.every.labeler)),
         "comparisons": float(len(data)),
-        "held_out": float(len(test)),
+        "held_out": float(len(problem.test.labeler)),
         "epochs": float(epochs),
         "temperature": heat,
     }
     metrics |= problem.likelihood.metrics()
     metrics |= _measure(problem, problem.train, data.subset(~out), scores, "")
-    if len(test):
+    if len(problem.test.labeler):
         metrics |= _measure(problem, problem.test, test, scores, "_held_out")
-    return Fitted(metrics, judged_probability(predict(scores, test), errors[test.group]), test.preference)
+    return Fitted(metrics, answering.of(test.group).expected(logits), test.preference)
 
 
 def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.Generator) -> Tensor:
@@ -126,19 +130,19 @@ def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.G
     return torch.as_tensor(rng.multinomial(count, np.full(count, 1 / count), size=members), dtype=torch.float32)
 
 
-def predict(scores: Tensor, data: Batch[C]) -> Floats:
-    """(M,) the members' mean probability that the first candidate is better."""
-    predicted: Floats = preference_logits(scores, data.edges).sigmoid().mean(0).double().numpy()
-    return predicted
+def _logits(scores: Tensor, data: Batch[C]) -> Floats:
+    """(E, M): how much better each member finds the first candidate of each comparison."""
+    found: Floats = preference_logits(scores, data.edges).double().numpy()
+    return found
 
 
 def _measure(problem: Problem[C], part: Terms, data: Batch[C], scores: Tensor, suffix: str) -> Metrics:
     """The ensemble's loss on judgements, and accuracy and calibration of its mean prediction on what they imply."""
-    predicted = predict(scores, data)
-    judged = judged_probability(predicted, problem.likelihood.pair_errors(problem.every)[data.group])
+    logits = _logits(scores, data)
+    judged = problem.likelihood.answering(problem.every).of(data.group).expected(logits)
     values = {
         "loss": ensemble_loss(problem, part, scores),
-        "accuracy": accuracy(predicted, data.preference),
+        "accuracy": accuracy(expit(logits).mean(0), data.preference),
         "brier": brier(judged, data.preference),
         "calibration_error": calibration_error(judged, data.preference),
     }
@@ -153,3 +157,14 @@ def _check_finite(scores: Tensor, candidates: Sequence[C]) -> None:
             f"reward member {member} scored candidate {candidates[at].id[:12]} as {float(scores[member, at])}; "
             "expected finite scores: lower fitting.learning_rate, or look for NaN in that candidate"
         )
+
+
+def _check_inputs(problem: Problem[C]) -> None:
+    """A network can turn an infinite input into a finite score, and still have no gradient."""
+    for x in problem.stacked.values():
+        bad = (~x.isfinite()).view(len(x), -1).any(1).nonzero()
+        if len(bad):
+            raise FloatingPointError(
+                f"candidate {problem.candidates[int(bad[0])].id[:12]} holds numbers that are not finite: look for NaN "
+                "or inf in it"
+            )

@@ -1,14 +1,16 @@
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
-from prefrl.fit.descent import Problem, _Descent
+from prefrl.fit.descent import UNJUDGED, Problem, _Descent
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.terms import terms
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Segment
+from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment
 
 
 class Given:
@@ -69,3 +71,19 @@ def test_the_prior_of_error_rates_is_weighed_against_all_that_was_judged(make_se
     mean = one.loss(one.train, one.weight, torch.Generator())
     total = one.total(one.reward.scores(one.stacked)) + one.likelihood.prior()
     torch.testing.assert_close(mean, total[0] / 10)  # two choices, each of weight 5
+
+
+@pytest.mark.parametrize("kind", ["comparison", "ranking", "rating"])
+def test_pseudo_labels_are_counted_by_judgement_whatever_its_kind(
+    make_segment: Callable[..., Segment], kind: str
+) -> None:
+    queries = [Query(tuple(make_segment() for _ in range(2 if kind == "comparison" else 4))) for _ in range(5)]
+    made: dict[str, Callable[[Query[Segment]], Any]] = {
+        "comparison": lambda q: Comparison(q.id, 1.0),
+        "ranking": lambda q: Ranking(q.id, (0, 1, 1, 1)),
+        "rating": lambda q: Rating(q.id, (0, 1, 2, 2), 3),
+    }
+    judged = [Judged(q, made[kind](q)) for q in queries]
+    one = problem([0.0] * len({c.id for q in queries for c in q.candidates}), judged, pseudo_labels=1.0)
+    one = replace(one, candidates=[*one.candidates, *(make_segment() for _ in range(10))])
+    assert len(one._unjudged(one.train, torch.Generator())) == UNJUDGED * 5

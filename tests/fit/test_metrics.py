@@ -2,8 +2,11 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from prefrl.fit.metrics import accuracy, brier, calibration_error, judged_probability, temperature
+from prefrl.fit.losses import davidson, rao_kupper
+from prefrl.fit.metrics import Answering, accuracy, brier, calibration_error, log_losses, temperature
+from prefrl.fit.terms import Ties
 
 
 def test_accuracy_leaves_ties_out_and_gives_half_for_an_even_prediction() -> None:
@@ -41,17 +44,45 @@ def test_a_temperature_finds_by_how_much_logits_are_too_large(rng: np.random.Gen
     assert temperature(3 * true, preference) == pytest.approx(3, rel=0.1)
     error = np.full(5000, 0.2)
     turned = np.where(rng.uniform(size=5000) < error, 1 - preference, preference)
-    assert temperature(3 * true, turned, error) == pytest.approx(3, rel=0.2)
+    assert temperature(3 * true, turned, Answering(error=error)) == pytest.approx(3, rel=0.2)
 
 
 def test_few_comparisons_move_a_temperature_little() -> None:
     assert temperature(np.zeros((2, 0)), np.zeros(0)) == 1.0
     wrong = np.array([[4.0, 4.0]])
     many, few, light = (
-        temperature(np.tile(wrong, n), np.zeros(2 * n), 0.0, w) for n, w in ((50, 1.0), (1, 1.0), (1, 0.1))
+        temperature(np.tile(wrong, n), np.zeros(2 * n), None, w) for n, w in ((50, 1.0), (1, 1.0), (1, 0.1))
     )
     assert 1.0 < light < few < many
 
 
 def test_the_probability_of_an_answer_is_mixed_with_mistakes() -> None:
-    assert judged_probability(np.array([0.9]), 0.1)[0] == pytest.approx(0.9 * 0.9 + 0.1 * 0.1)
+    logits = np.log([[0.9 / 0.1]])
+    assert Answering(error=0.1).expected(logits)[0] == pytest.approx(0.9 * 0.9 + 0.1 * 0.1)
+    blind = Answering("davidson", tie=1.0, error=2 / 3)  # one of three answers, whatever is felt
+    assert blind.expected(logits)[0] == pytest.approx(0.5)
+    assert Answering(error=np.array([0.5, 0.0])).of(np.array([1])).expected(logits)[0] == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(("ties", "tie"), [("davidson", 0.7), ("rao_kupper", 0.4)])
+@pytest.mark.parametrize("error", [0.0, 0.2])
+def test_an_expected_preference_is_that_of_the_likelihood_with_a_tie_as_a_half(
+    ties: Ties, tie: float, error: float
+) -> None:
+    scores = torch.tensor([[[1.0, -0.3], [0.2, 2.0], [0.0, 0.0]], [[-1.0, 0.5], [3.0, 0.0], [0.1, 0.1]]]).double()
+    free = torch.full((2,), math.log(tie) if ties == "davidson" else math.log(math.expm1(tie))).double()
+    loss = davidson if ties == "davidson" else rao_kupper
+    wins, half = torch.tensor([[1.0, 0.0]] * 3), torch.tensor([[0.5, 0.5]] * 3)
+    first = (-loss(scores, wins, torch.zeros(3, dtype=torch.bool), free, error)).exp()
+    tied = (-loss(scores, half, torch.ones(3, dtype=torch.bool), free, error)).exp()
+    expected = (first + tied / 2).mean(0).numpy()
+    logits = (scores[..., 0] - scores[..., 1]).numpy()
+    np.testing.assert_allclose(Answering(ties, tie, error).expected(logits), expected, rtol=1e-6)
+    each = np.full((2, 1), tie)
+    np.testing.assert_allclose(Answering(ties, each, error).expected(logits), expected, rtol=1e-6)
+
+
+def test_log_losses_are_finite_however_sure_a_model_is() -> None:
+    sure, preference = np.array([[1000.0, -1000.0]]), np.array([1.0, 1.0])
+    assert log_losses(sure, preference, Answering()).mean() == 500.0
+    assert log_losses(sure, preference, Answering("davidson", 0.5)).mean() == pytest.approx(250.0, rel=0.01)

@@ -271,6 +271,67 @@ def test_error_rates_of_labelers_are_learned_beside_the_reward(items: list[Segme
         assert fitted.metrics[f"error_rate/{name}"] == pytest.approx(wrong, abs=0.1)
 
 
+@pytest.mark.parametrize(("ties", "nu"), [("davidson", 3.0), ("rao_kupper", 2.0)])
+def test_modelled_ties_leave_a_right_model_calibrated(items: list[Segment], ties: str, nu: float) -> None:
+    rng = np.random.default_rng(0)
+    judged = [one for _ in range(60) for one in outcomes(items, WORTH, rng, tie=nu, wrong=0.0)]
+    reward: Any = Table()
+    settings = MLE.model_copy(update={"ties": ties, "epochs": 400})
+    metrics = fit_judged(reward, judged, settings, rng).metrics
+    assert metrics["calibration_error"] < 0.06
+    assert metrics["temperature"] == 1.0  # nothing is held out
+
+
+def test_a_second_answer_of_one_person_is_of_the_same_person(items: list[Segment]) -> None:
+    some = list(outcomes(items, WORTH, np.random.default_rng(0), 0.0, 0.0))
+    named = [
+        replace(one, judgement=replace(one.judgement, labeler=n))
+        for one, n in zip(some, ["ann", "ann#2"] * 5, strict=True)
+    ]
+    settings = MLE.model_copy(update={"reliability": "learned", "epochs": 1})
+    reward: Any = Table()
+    found = fit_judged(reward, named, settings, np.random.default_rng(0)).metrics
+    assert [name for name in found if name.startswith("error_rate/")] == ["error_rate/ann"]
+
+
+def test_ratings_of_single_candidates_are_held_out_and_measured_too(make_segment: Callable[..., Segment]) -> None:
+    rated = [Query((make_segment(),)) for _ in range(60)]
+    levels = [(planted(q.candidates[0]) > 0) + (planted(q.candidates[0]) > 3) for q in rated]
+    judged = [Judged(q, Rating(q.id, (int(level),), 3)) for q, level in zip(rated, levels, strict=True)]
+    metrics = fit_judged(model(), judged, FittingSettings(epochs=2, held_out=0.3), np.random.default_rng(0)).metrics
+    assert metrics["held_out"] > 5
+    assert np.isfinite(metrics["loss_held_out"])
+    assert np.isnan(metrics["accuracy_held_out"])  # single ratings compare nothing
+
+
+def test_an_input_that_a_network_hides_is_named_too(judged: list[Judged[Segment]]) -> None:
+    bad = judged[3].query.candidates[1]
+    bad.observations[0, 0] = np.inf  # tanh makes 1 of it
+    for kind in ("mlp", "linear"):
+        settings: Any = settings_class("rewards", kind)
+        reward = settings().build(Task(), np.random.default_rng(0))
+        with pytest.raises(FloatingPointError, match=f"candidate {bad.id[:12]} holds numbers that are not finite"):
+            fit_judged(reward, judged[:20], FittingSettings(held_out=0), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("given", [{"patience": 3}, {"weight_decay": "adaptive"}])
+def test_what_needs_held_out_judgements_says_so(given: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="needs held-out judgements"):
+        FittingSettings(held_out=0, **given)
+
+
+def test_scores_are_centred_where_that_is_wanted(judged: list[Judged[Segment]]) -> None:
+    def mean(centre: float) -> float:
+        reward = model(1)
+        with torch.no_grad():
+            list(reward.parameters())[-1].fill_(1.0)  # the last bias
+        settings = FittingSettings(epochs=60, learning_rate=0.03, centre=centre)
+        fit_judged(reward, judged[:60], settings, np.random.default_rng(0))
+        return abs(float(reward.raw_member_scores([c for j in judged[:60] for c in j.query.candidates]).mean()))
+
+    assert mean(1.0) < 0.2 * mean(0.0)
+
+
 def test_ratings_and_comparisons_are_fitted_on_one_reward(make_segment: Callable[..., Segment]) -> None:
     pool = [make_segment() for _ in range(240)]
     cuts = np.quantile([planted(s) for s in pool], [0.25, 0.5, 0.75])
