@@ -8,7 +8,7 @@ import sys
 from datetime import datetime
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: 
 
 app = typer.Typer(
     help="Learn what people prefer, and act on it: sample, label, fit, improve, evaluate.",
+    epilog="Exit status: 0 done; 1 `verify` found something wrong; 2 a mistake, told on stderr; 130 stopped by Ctrl-C.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -76,7 +77,9 @@ def label(
         str, typer.Argument(help="A preset, a YAML file, or the folder of a run whose policy is asked about.")
     ],
     overrides: Overrides = None,
-    out: Out = Path("labels"),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The folder that is written; default: labels.")
+    ] = None,
     given: Annotated[
         Path | None, typer.Option(help='JSON lines {"prompt", "responses"} to ask about.', exists=True)
     ] = None,
@@ -90,25 +93,31 @@ def label(
     """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
     from prefrl import stages
     from prefrl.console import say
+    from prefrl.log import has_store
     from prefrl.rundir import open_saved
 
-    extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(out / 'clips'))}"] if terminal else []
+    there = serve and has_store(Path(source))
+    _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
+    _refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
+    own = there and (out is not None or given is not None)
+    _refuse(own, f"{source} has queries of its own: --out and --given are for new ones")
+    folder = Path(source) if there else out or Path("labels")
+    extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(folder / 'clips'))}"] if terminal else []
     if serve:
         extra = ["labeler.kind=web", *[f"labeler.host={host}"] * bool(host)]
         extra += [f"labeler.port={port}"] * (port is not None)
-    there = serve and (Path(source) / "store.db").exists()
     policy = open_saved(source) if Path(source).is_dir() and not there else None
     path = str(policy.folder / "config.yaml") if policy else source
     settings = [*extra, *(overrides or [])]
     try:
         if there:
-            out, counts = Path(source), stages.serve(Path(source), settings, say)
+            stages.serve(folder, settings, say)
         else:
-            counts = stages.label(_load(path, settings), out, policy, given, say)
+            stages.label(_load(path, settings), folder, policy, given, say)
     except KeyboardInterrupt:
-        say(f"stopped; what was answered is in {out}. Go on with the same command")
+        say(f"stopped; what was answered is in {folder}. Go on with the same command")
         raise
-    say(f"{counts['answered']} of {counts['asked']} queries answered, {counts['skipped']} skipped, in {out}")
+    say(_progress(folder))
 
 
 @app.command()
@@ -229,6 +238,21 @@ def doctor() -> None:
     console.print(diagnose())
 
 
+def _refuse(wrong: bool, why: str) -> None:
+    """Options that would be ignored are a mistake."""
+    if wrong:
+        raise ValueError(why)
+
+
+def _progress(folder: Path) -> str:
+    """How far the queries of a store are answered, by however many people."""
+    from prefrl.store import Store
+
+    with Store[Any](folder, write=False) as store:
+        asked, answered, skipped = store.progress()
+    return f"{answered} of {asked} queries answered, {skipped} skipped, in {folder}"
+
+
 def _new_folder(source: str) -> Path:
     """Of a run of control/hopper: runs/control-hopper-20261124-091500, with a 2 behind it where that is taken."""
     name = Path(source).stem if Path(source).exists() else source.replace("/", "-")
@@ -268,5 +292,5 @@ def main() -> None:
 
         text = missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
         for line in text.splitlines():
-            errors.print(f"error: {line}", style="red", markup=False)
+            errors.print(f"error: {line}", style="red", markup=False, soft_wrap=True)
         sys.exit(2)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +14,7 @@ import typer
 if TYPE_CHECKING:
     from prefrl.label.exchange import Imported
     from prefrl.label.formats import Layout, Which
+    from prefrl.store import Store
 
 commands = typer.Typer()
 Out = Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")]
@@ -68,10 +72,13 @@ def export_(
     ties: Annotated[Ties, typer.Option(help="In the columns of TRL: leave ties out, or write them both ways.")] = (
         Ties.drop
     ),
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Write judgements, or a reward model of text, to files, and say what these could not hold."""
     from prefrl.console import say
 
+    if to.is_file() and not force:
+        raise ValueError(f"{to} is there already: choose another name, or write over it with --force")
     if form is Form.classifier:
         from prefrl.stages import export_classifier
 
@@ -111,22 +118,52 @@ def import_(
     for note in done.notes:
         for line in note.splitlines()[:SHOWN]:
             say(line, "yellow")
-    say(f"{done.read} judgements {'would be read' if dry_run else 'read'} into {out}")
+    new = f": {done.read - done.known} new, {done.known} there already" if done.known else ""
+    say(f"{done.read} judgements {'would be read' if dry_run else 'read'} into {out}{new}")
 
 
 def _import(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
     from prefrl.label.exchange import import_judgements
-    from prefrl.store import Store
 
-    with Store[Any](out) as store:
+    with _store(out) as store:
         return import_judgements(path, store, which, layout)
 
 
 def _try(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
     from prefrl.label.exchange import try_import
+    from prefrl.log import has_store
     from prefrl.store import Store
 
-    if not any((out / name).exists() for name in ("store.db", "store.url")):
+    if not has_store(out):
         return try_import(path, None, which, layout)
     with Store[Any](out, write=False) as store:
         return try_import(path, store, which, layout)
+
+
+@contextmanager
+def _store(folder: Path) -> Iterator[Store[Any]]:
+    """The store of a folder. One that had to be made is removed again where something fails."""
+    from prefrl.log import has_store
+    from prefrl.store import Store
+
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    before = set(folder.iterdir()) if folder.is_dir() else set()
+    opened, new = False, not has_store(folder)
+    try:
+        with Store[Any](folder) as store:
+            opened = True
+            yield store
+    except BaseException:
+        if opened and new:  # one that cannot be opened may be somebody else's
+            _remove({*folder.iterdir()} - before)
+            for path in made:
+                path.rmdir()
+        raise
+
+
+def _remove(paths: set[Path]) -> None:
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()

@@ -56,8 +56,9 @@ def backup(
 def migrate(folder: Folder) -> None:
     """Bring a store that an older prefrl made up to date; a copy of its database is kept in backups/."""
     from prefrl.console import say
-    from prefrl.log import EventLog
+    from prefrl.log import EventLog, require_store
     from prefrl.tables import SCHEMA
 
+    require_store(folder)
     EventLog(folder, write=True).close()
     say(f"{folder} has schema {SCHEMA}")

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+import numpy as np
 
 from prefrl.blobs import read_arrays
 from prefrl.engines import StoreError
@@ -14,7 +19,6 @@ from prefrl.types import (
     Candidate,
     Choice,
     Comparison,
-    Query,
     Ranking,
     Rating,
     Response,
@@ -26,16 +30,22 @@ from prefrl.types import (
 ANSWER_TYPES: dict[str, type[Answer]] = dict(zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Skip), strict=True))
 PORTABLE = ("candidate", "query", *ANSWERS, "retract", "assign", "repeat", "guideline", "flag")
 """Kinds that a copy for others holds: what was asked and answered, not who may come in or how the project is set."""
-
-
-class Asked(Protocol):
-    """Queries that are known, with the ids of their candidates."""
-
-    def __contains__(self, id: str) -> bool: ...
-
-    def __getitem__(self, id: str) -> list[str]: ...
-
-    def __setitem__(self, id: str, candidates: list[str]) -> None: ...
+LARGEST = 2**31 - 1
+"""The largest whole number in an event from elsewhere: every database and every table holds it."""
+LEVELS = 10_000
+"""Levels of a rating scale at most: a fit has a threshold between each two of them."""
+DEEPEST = 20
+"""How deeply lists and objects may be nested in an event from elsewhere."""
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?(Z|[+-]\d\d:\d\d)", re.ASCII)
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")
+_HEX = "[0-9a-f]{32}"
+_IDS = {
+    "assign": re.compile(_HEX),
+    "repeat": re.compile(f"repeat:{_HEX}(:{_HEX})?"),
+    "guideline": re.compile(r"guideline:.*", re.DOTALL),
+    "flag": re.compile(r"flag:.*", re.DOTALL),
+}
+"""What ids look like that are not made of what they name: none may stand in the place of an answer's."""
 
 
 def describe(candidate: Candidate) -> dict[str, Any]:
@@ -65,70 +75,132 @@ def read_answer(kind: str, query: str, labeler: str, body: dict[str, Any]) -> An
     return ANSWER_TYPES[kind](query=query, labeler=labeler, **values)
 
 
-def check_event(one: dict[str, Any], queries: Asked, candidates: dict[str, Any], blobs: Path) -> None:
-    """Check an event from elsewhere against those before it, and remember it if later ones may speak of it.
+# --- from elsewhere -----------------------------------------------------------------------------------------------
+
+
+def check_answer(answer: Answer, size: int) -> None:
+    """`check_fits`, and whether each value is of its kind, and no larger than a store and its readers can take.
+
+    Raises `ValueError`.
+    """
+    check_fits(answer, size)
+    check_text("labeler", answer.labeler)
+    if answer.shown and not _is_order(answer.shown, size):
+        raise ValueError(f"shown: expected each of 0 to {size - 1} once, got {answer.shown!r:.200}")
+    if not isinstance(answer, Skip) and not _is_finite(answer.weight):
+        raise ValueError(f"weight: expected a finite number, got {answer.weight!r:.40}")
+    match answer:
+        case Comparison(preference=preference):
+            good, expected = _is_finite(preference), "a preference that is a number"
+        case Ranking(ranks=ranks):
+            good, expected = all(map(is_whole, ranks)), f"ranks that are whole numbers up to {LARGEST}"
+        case Choice(best=best):
+            good, expected = is_whole(best), "the number of the best candidate"
+        case Rating(levels=levels, scale=scale):
+            good = is_whole(scale, LEVELS) and all(map(is_whole, levels))
+            expected = f"levels that are whole numbers, on a scale of at most {LEVELS}"
+        case Skip(reason=reason):
+            good, expected = reason in ("skip", "incomparable"), "the reason skip or incomparable"
+    if not good:
+        raise ValueError(f"expected {expected}, got {answer!r:.300}")
+
+
+def check_text(name: str, value: Any) -> None:
+    """Raise `ValueError` unless a value is text that every database can hold."""
+    if not isinstance(value, str) or _NO_TEXT.search(value):
+        raise ValueError(f"{name}: expected text that is valid Unicode, without NUL, got {value!r:.200}")
+
+
+def is_whole(value: Any, most: int = LARGEST) -> bool:
+    """Whether a JSON value is a whole number from 0 on, true and false not among them."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _is_order(shown: Any, size: int) -> bool:
+    return isinstance(shown, Sequence) and all(map(is_whole, shown)) and sorted(shown) == list(range(size))
+
+
+def check_event(one: Mapping[str, Any]) -> None:
+    """Check what an event from elsewhere says by itself, whatever came before it.
 
     Raises `ValueError`, `KeyError`, `TypeError` or `AttributeError` for one that cannot be believed.
     """
-    if not all(isinstance(one[name], str) for name in ("id", "kind", "subject", "actor", "at")):
-        raise TypeError("id, kind, subject, actor and at must be strings")
+    for name in ("id", "kind", "subject", "actor", "at"):
+        check_text(name, one[name])
     if one["kind"] not in PORTABLE:
-        raise StoreError(f"unknown kind {one['kind']!r}")
-    about = one["body"].get("about", {})
-    if not isinstance(about, dict) or not all(isinstance(about.get(n, ""), str) for n in ("submission", "assignment")):
-        raise TypeError("about must be an object, its submission and assignment strings")
-    if one["kind"] == "candidate":
-        candidates[one["id"]] = load_candidate(one["id"], one["body"], blobs)
-    elif one["kind"] == "query":
-        queries[one["id"]] = _check_query(one["id"], one["body"], candidates)
-    elif one["kind"] in ("guideline", "flag"):
-        _check_words(one)
-    elif one["subject"] not in queries:
-        raise StoreError(f"it speaks of query {one['subject'][:12]}, which is not there")
-    else:
-        _check_reply(one, len(queries[one["subject"]]))
+        raise StoreError(f"unknown kind {one['kind']!r:.40}")
+    if not _TIME.fullmatch(one["at"]):
+        raise StoreError(f"at: expected a time as 2026-01-31T12:00:00+00:00, got {one['at']!r:.40}")
+    datetime.fromisoformat(one["at"])
+    if one["kind"] in _IDS and not _IDS[one["kind"]].fullmatch(one["id"]):
+        raise StoreError(f"its id {one['id'][:40]!r} is not that of an event of kind {one['kind']!r}")
+    if one["kind"] in ("guideline", "flag") and not isinstance(one["body"]["text"], str):
+        raise StoreError(f"text: expected a string, got {one['body']['text']!r:.200}")
+    _check_values(one["body"])
+    _check_about(one["body"].get("about", {}))
 
 
-def _check_reply(one: dict[str, Any], size: int) -> None:
-    """What somebody said to a query, or was shown of it."""
-    if one["kind"] == "assign":
-        _check_assignment(one, size)
-    elif one["kind"] == "repeat":
-        if not re.fullmatch("repeat:[0-9a-f]{32}", one["id"]):
-            raise StoreError(f"its id {one['id'][:20]!r} is not that of a repeated answer")
-        answer = dict(one["body"]["answer"])
-        check_fits(read_answer(answer.pop("kind"), one["subject"], one["actor"], answer), size)
-    elif not one["id"].startswith(f"{one['subject']}:{one['actor']}:"):
-        raise StoreError(f"its id {one['id'][:20]} is not that of an answer to its query by its labeler")
-    elif one["kind"] in ANSWERS:
-        try:
-            check_fits(read_answer(one["kind"], one["subject"], one["actor"], one["body"]), size)
-        except ValueError as error:
-            raise StoreError(str(error)) from None
+def _check_values(value: Any, depth: int = 0) -> None:
+    """Raise `StoreError` for numbers that no database holds, and for what no reader can follow."""
+    if depth > DEEPEST:
+        raise StoreError(f"its body is nested more than {DEEPEST} deep")
+    if isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) < 2.0**63:
+        raise StoreError(f"a number in its body is too large: {value!r:.40}")
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check_values(part, depth + 1)
 
 
-def _check_assignment(one: dict[str, Any], size: int) -> None:
-    body = one["body"]
-    if not re.fullmatch("[0-9a-f]{32}", one["id"]):
-        raise StoreError(f"its id {one['id'][:20]!r} is not that of an assignment")
+_ABOUT: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("submission", "digest", "assignment"), (str,)),
+    **dict.fromkeys(("guideline", "comment", "outcome", "strength"), (str, type(None))),
+    **dict.fromkeys(("ranking", "flags"), (list, type(None))),
+    "timings": (dict, type(None)),
+}
+"""What is read of how an answer came about; whatever else stands there is kept, and read by nobody."""
+
+
+def _check_about(about: Any) -> None:
+    for name, kinds in _ABOUT.items():
+        if name in about and not isinstance(about[name], kinds):
+            raise StoreError(f"about.{name}: expected {kinds[0].__name__}, got {about[name]!r:.200}")
+    decision = (about.get("timings") or {}).get("decision_ms")
+    if decision is not None and not (_is_finite(decision) and decision >= 0):
+        raise StoreError(f"about.timings.decision_ms: expected a number from 0 on, got {decision!r:.40}")
+
+
+def check_assignment(body: Mapping[str, Any], size: int) -> None:
+    """What was put to somebody of a query of `size` candidates. Raises `StoreError`."""
     if body["purpose"] not in ("label", "check", "repeat") or not isinstance(body.get("guideline", ""), str):
         raise StoreError(f"an assignment has a purpose and a guideline, got {body!r:.200}")
-    if sorted(body["shown"]) != list(range(size)):
+    if not _is_order(body["shown"], size):
         raise StoreError(f"an assignment shows each of {size} candidates once, got {body['shown']!r:.200}")
 
 
-def _check_words(one: dict[str, Any]) -> None:
-    if not isinstance(one["body"]["text"], str):
-        raise TypeError("its text must be a string")
-
-
-def _check_query(id: str, body: dict[str, Any], candidates: dict[str, Any]) -> list[str]:
-    """The candidates of a query from elsewhere; they must be there, and make up its id."""
+def check_purpose(body: Mapping[str, Any], size: int) -> None:
+    """What a query of `size` candidates was asked for. Raises `StoreError`."""
     purpose, expected = body.get("purpose", "label"), body.get("expected")
-    if Query(tuple(candidates[c] for c in body["candidates"])).id != id:
-        raise StoreError(f"query {id[:12]} does not have the sha256 of its candidates")
-    if purpose not in ("label", "check") or not isinstance(body.get("batch", 0), int):
-        raise StoreError(f"query {id[:12]} has the purpose {purpose!r:.40}; expected label or check")
-    if (purpose == "check") != (expected in range(len(body["candidates"])) and expected is not None):
-        raise StoreError(f"query {id[:12]} is a check, and names its best candidate, or neither")
-    return list(body["candidates"])
+    if purpose not in ("label", "check") or not is_whole(body.get("batch", 0)):
+        raise StoreError(f"a query has a purpose, label or check, and the number of its batch, got {body!r:.200}")
+    if (purpose == "check") != is_whole(expected, size - 1) or (purpose == "label" and expected is not None):
+        raise StoreError(f"a query is a check, and names its best candidate, or neither, got {body!r:.200}")
+
+
+def load_foreign(id: str, body: dict[str, Any], blobs: Path) -> Candidate:
+    """`load_candidate` for one from elsewhere. Raises `StoreError` where a part of it is not of its kind."""
+    loaded: Candidate = load_candidate(id, body, blobs)
+    if body != describe(loaded) or not all(isinstance(body.get(n, ""), str) for n in ("prompt", "text", "episode")):
+        raise StoreError(f"candidate {id[:12]} is not described as it is: {body!r:.200}")
+    if isinstance(loaded, Segment):
+        if not is_whole(loaded.start):
+            raise StoreError(f"candidate {id[:12]} starts at step {loaded.start!r:.40}; expected a number from 0 on")
+        for name in ("observations", "actions"):
+            array = getattr(loaded, name)
+            if array.dtype.kind != "f" or not np.isfinite(array).all():
+                raise StoreError(f"candidate {id[:12]}: its {name} are not all finite floats")
+    elif not all(is_whole(token) for token in (*loaded.prompt_tokens, *loaded.tokens)):
+        raise StoreError(f"candidate {id[:12]} has tokens that are no numbers from 0 on")
+    return loaded

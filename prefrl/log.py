@@ -23,8 +23,6 @@ from prefrl.tables import SCHEMA, chained, event, meta, metadata, version
 
 BALLAST = 8 * 2**20
 """Bytes kept in reserve while people label: a full disk still has room to close the books."""
-
-
 _KNOWN = sql.select(event.c.id, event.c.seq).where(event.c.id == sql.bindparam("b_id"))
 _INSERT = sql.insert(event)
 
@@ -103,9 +101,9 @@ class EventLog:
         Without `url`, a file `store.url` in the folder may name another SQLAlchemy database. Raises `StoreError` where
         another process writes, where there is none to read, where the file is damaged, or where a newer prefrl made it.
         """
+        if not write and url is None:
+            require_store(folder)
         url = url or engines.saved_url(folder)
-        if not write and url is None and not (folder / "store.db").exists():
-            raise StoreError(f"{folder} holds no store: expected the file {folder / 'store.db'}")
         self.folder = folder
         self.full = False
         """Whether the disk was full when it was last written to."""
@@ -153,10 +151,8 @@ class EventLog:
                 if not _says_full(error):
                     raise
                 self._is_full()
-                raise StoreFull(
-                    f"the disk with {self.folder} is full: nothing more can be stored until there is room; what was "
-                    "acknowledged is safe"
-                ) from error
+                says = "nothing more can be stored until there is room; what was acknowledged is safe"
+                raise StoreFull(f"the disk with {self.folder} is full: {says}") from error
 
     def append(self, rows: Iterable[dict[str, Any]]) -> None:
         """Add the events whose id is new, in one transaction that is on disk when this returns."""
@@ -180,9 +176,8 @@ class EventLog:
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            raise StoreFull(
-                f"the disk with {self.folder} is still full: make room, and answers are taken again"
-            ) from None
+            says = "make room, and answers are taken again"
+            raise StoreFull(f"the disk with {self.folder} is still full: {says}") from None
         self.full = False
 
     # --- reading ---------------------------------------------------------------------------------------------
@@ -227,6 +222,17 @@ class EventLog:
             from prefrl.migrate import migrate
 
             migrate(writer, self.folder)
+
+
+def has_store(folder: Path) -> bool:
+    """Whether a folder holds a store, or names the database of one."""
+    return (folder / "store.db").exists() or engines.saved_url(folder) is not None
+
+
+def require_store(folder: Path) -> None:
+    """Raise `StoreError` unless there is a store: what cares for one must not make one."""
+    if not has_store(folder):
+        raise StoreError(f"{folder} holds no store: expected the file {folder / 'store.db'}, or store.url beside it")
 
 
 def head(connection: Connection, folder: Path) -> tuple[int, str]:
@@ -286,6 +292,8 @@ __all__ = [
     "StoreError",
     "StoreFull",
     "Transaction",
+    "has_store",
     "head",
+    "require_store",
     "row",
 ]

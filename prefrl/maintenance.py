@@ -17,7 +17,7 @@ from sqlalchemy.exc import DatabaseError
 from prefrl import engines
 from prefrl.events import load_candidate
 from prefrl.files import check_free, verify, whole_folder, write_file
-from prefrl.log import StoreError, check_schema
+from prefrl.log import StoreError, check_schema, require_store
 from prefrl.projection import KINDS, all_events, chunks, dump, project, rebuild
 from prefrl.tables import SCHEMA, chained, event, meta, metadata, version
 
@@ -68,20 +68,23 @@ def verify_store(folder: Path) -> Verified:
 
 
 def repair_derived(folder: Path) -> None:
-    """Write the derived tables again from the log. Raises `StoreError` where the log itself is damaged."""
+    """Write the derived tables again from the log. Raises `StoreError` where the log is damaged, or there is none."""
+    require_store(folder)
     lock = engines.own(folder)
-    writer = engines.writer(folder, engines.saved_url(folder))
     try:
-        with writer.begin() as connection:
+        with _opened(folder) as connection:
+            check_schema(connection, folder)
             found = Verified()
             _check_chain(connection, found)
-            if not found.ok:
-                raise StoreError(
-                    f"the log in {folder} is damaged ({found.faults[0]}); save what is whole, with --salvage"
-                )
-            rebuild(connection)
+        if not found.ok:
+            raise StoreError(f"the log in {folder} is damaged ({found.faults[0]}); save what is whole, with --salvage")
+        writer = engines.writer(folder, engines.saved_url(folder))
+        try:
+            with writer.begin() as connection:
+                rebuild(connection)
+        finally:
+            writer.dispose()
     finally:
-        writer.dispose()
         engines.disown(folder, lock)
 
 
@@ -120,10 +123,8 @@ def salvage(folder: Path, to: Path) -> Verified:
 @contextmanager
 def _opened(folder: Path) -> Iterator[Connection]:
     """A connection for looking only, without asking whether all is well."""
-    url = engines.saved_url(folder)
-    if url is None and not (folder / "store.db").exists():
-        raise StoreError(f"{folder} holds no store: expected the file {folder / 'store.db'}")
-    engine = engines.reader(folder, url)
+    require_store(folder)
+    engine = engines.reader(folder, engines.saved_url(folder))
     try:
         with engine.connect() as connection:
             yield connection

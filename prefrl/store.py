@@ -7,16 +7,18 @@ One process writes at a time, from any of its threads; any number may read while
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic
 
 import sqlalchemy as sql
 
+from prefrl.arrivals import Merged, check_arrivals
 from prefrl.blobs import read_arrays, write_arrays
-from prefrl.events import ANSWER_TYPES, check_event, describe, load_candidate, read_answer
+from prefrl.events import ANSWER_TYPES, describe, load_candidate, read_answer
 from prefrl.log import EventLog, StoreError, Transaction, row
 from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
 from prefrl.tables import event, standing
@@ -112,22 +114,22 @@ class Store(Generic[C]):
         id = f"{query}:{labeler}:{word['revision']}:retract"
         return tx.append(row(id, "retract", query, labeler, {"about": about} if about else {}))
 
-    def merge(self, events: Iterable[dict[str, Any]], blobs: Path) -> int:
-        """Add the events of another store, arrays from its `blobs` folder; returns how many answers they hold.
+    def merge(self, events: Callable[[], Iterable[dict[str, Any]]], blobs: Path) -> Merged:
+        """Add the events of another store, arrays from its `blobs` folder; returns how many answers are new.
 
-        All or none: each is checked before anything is written. Raises `ValueError` naming the first bad event.
+        All or none, and few in memory at a time: each is checked before anything is written, so `events` is called
+        twice. Raises `ValueError` as `check_arrivals` does.
         """
-        events, queries = list(events), _Asked(self)
-        candidates: dict[str, Any] = {}
-        for number, one in enumerate(events, 1):
-            try:
-                check_event(one, queries, candidates, blobs)
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
-                raise ValueError(f"event {number} cannot be merged: {error}") from error
-        self._check_kind(candidates.values())
-        self._file(candidates.values())
-        self.log.append(events)
-        return sum(one["kind"] in ANSWERS for one in events)
+        with self.log.reading() as connection:
+            merged = check_arrivals(events(), blobs, connection)
+        with self.log.transaction() as tx, ThreadPoolExecutor(WRITERS) as pool:
+            for some in chunks(events(), CHUNK):
+                list(pool.map(partial(self._copy, blobs), (e for e in some if e["kind"] == "candidate")))
+                tx.extend(some)
+        return merged
+
+    def _copy(self, blobs: Path, one: dict[str, Any]) -> None:
+        self._file_one(load_candidate(one["id"], one["body"], blobs))
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
         """A store holds segments or responses, not both: a learner could make nothing of the others."""
@@ -242,24 +244,24 @@ class Store(Generic[C]):
             numbers = connection.execute(sql.select(*columns).where(asked.c.purpose == "label")).one()
         return dict(zip(("asked", "answered", "skipped"), (int(n or 0) for n in numbers), strict=True))
 
+    def progress(self) -> tuple[int, int, int]:
+        """How many queries were asked, how many of them have a judgement, and how many have nothing but skips."""
+        judged, skips = asked.c.judged > 0, asked.c.skipped + asked.c.incomparable > 0
+        done, left = sql.case((judged, 1), else_=0), sql.case((~judged & skips, 1), else_=0)
+        columns = (sql.func.count(), sql.func.sum(done), sql.func.sum(left))
+        with self.log.reading() as connection:
+            numbers = connection.execute(sql.select(*columns).where(asked.c.purpose == "label")).one()
+        total, answered, skipped = (int(n or 0) for n in numbers)
+        return total, answered, skipped
 
-class _Asked:
-    """The candidates of queries by id: those of a store, and those that are about to be merged."""
-
-    def __init__(self, store: Store[Any]) -> None:
-        self._store, self._new = store, dict[str, list[str]]()
-
-    def __setitem__(self, id: str, candidates: list[str]) -> None:
-        self._new[id] = candidates
-
-    def __getitem__(self, id: str) -> list[str]:
-        return self._new[id] if id in self._new else [c.id for c in self._store.query(id).candidates]
-
-    def __contains__(self, id: str) -> bool:
-        if id in self._new:
-            return True
-        with self._store.log.reading() as connection:
-            return connection.scalar(sql.select(asked.c.id).where(asked.c.id == id)) is not None
+    def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
+        """Which of these queries and candidates had been asked about by then."""
+        found: set[str] = set()
+        with self.log.reading() as connection:
+            for some in chunks(ids, CHUNK):
+                known = sql.select(event.c.id).where(event.c.id.in_(some), event.c.seq <= sequence)
+                found |= set(connection.scalars(known))
+        return found
 
 
 def _sizes(tx: Transaction, ids: Iterable[str]) -> dict[str, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import postgres_server
 import pytest
 import torch
 
@@ -14,6 +15,8 @@ from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
 if TYPE_CHECKING:
+    from shell import Shell
+
     from prefrl.envs.text import Reviews
 
 
@@ -66,6 +69,29 @@ def store(tmp_path: Path) -> Iterator[Store[Segment]]:
 def text_store(tmp_path: Path) -> Iterator[Store[Response]]:
     with Store[Response](tmp_path / "text") as opened:
         yield opened
+
+
+@pytest.fixture
+def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Shell:
+    """Runs `prefrl ...` in an empty folder."""
+    from shell import Shell
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    return Shell(monkeypatch, capsys)
+
+
+@pytest.fixture(scope="session")
+def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The URL of a PostgreSQL server of our own; without one the test is skipped."""
+    with postgres_server.running(tmp_path_factory.mktemp("postgres")) as url:
+        yield url
+
+
+@pytest.fixture
+def postgres_url(postgres: str) -> str:
+    """A new database there."""
+    return postgres_server.new_database(postgres)
 
 
 @pytest.fixture(scope="session")

@@ -9,34 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+from shell import Shell
 
-from prefrl.cli import main
 from prefrl.components import TABLE, kinds
-
-
-@pytest.fixture
-def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> "Shell":
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "160")
-    return Shell(monkeypatch, capsys)
-
-
-class Shell:
-    """Runs `prefrl ...` in this process, and keeps what was printed."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch, self._capsys = monkeypatch, capsys
-        self.out = self.err = ""
-
-    def __call__(self, line: str) -> int:
-        self._monkeypatch.setattr(sys, "argv", ["prefrl", *line.split()])
-        try:
-            main()
-            code = 0
-        except SystemExit as error:
-            code = int(error.code or 0)
-        self.out, self.err = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in self._capsys.readouterr())
-        return code
 
 
 def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
@@ -96,19 +71,6 @@ def test_the_three_uses_stand_alone_for_text(prefrl: Shell) -> None:
     assert prefrl("improve text/toy --reward reward --out policy loop.rounds=1") == 0
     assert prefrl("evaluate policy") == 0
     assert "fluency" in prefrl.out
-
-
-def test_candidates_of_ones_own_can_be_labelled(prefrl: Shell) -> None:
-    rows = [{"prompt": "this film was", "responses": [" wonderful .", " terrible .", " long ."]}]
-    Path("given.jsonl").write_text("\n".join(json.dumps(row) for row in rows))
-    assert prefrl("label text/toy --given given.jsonl --out labels") == 0
-    assert prefrl("export labels --to out.jsonl") == 0
-    best = {json.loads(line)["chosen"] for line in Path("out.jsonl").read_text().splitlines()}
-    assert " wonderful ." in best
-    assert " terrible ." not in best
-    Path("given.jsonl").write_text('{"prompt": "p"}')
-    assert prefrl("label text/toy --given given.jsonl --out other") == 2
-    assert "row 1: expected" in prefrl.err
 
 
 def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
@@ -233,26 +195,9 @@ def test_a_run_that_never_learns_anything_says_so(prefrl: Shell) -> None:
     assert "nothing was learned" in prefrl.err
 
 
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ('{"prompt": "p", "responses": "bad"}', "row 1: expected"),
-        ('{"prompt": "p", "responses": ["a"]}', "row 1: a query needs at least 2"),
-        ("", "at least one row"),
-    ],
-)
-def test_given_candidates_are_checked(prefrl: Shell, row: str, message: str) -> None:
-    Path("given.jsonl").write_text(row)
-    assert prefrl("label text/toy --given given.jsonl --out labels") == 2
-    assert message in prefrl.err
-    assert prefrl("label control/toy --given given.jsonl --out other") == 2
-    assert "is no text task" in prefrl.err
-
-
-def test_asking_for_more_labels_asks_for_the_rest(prefrl: Shell) -> None:
-    assert prefrl("label control/toy --out labels loop.labels=5") == 0
-    assert prefrl("label control/toy --out labels loop.labels=12") == 0
-    assert "12 of 12 queries answered" in prefrl.out
+def test_help_says_what_exit_statuses_mean(prefrl: Shell) -> None:
+    assert prefrl("--help") == 0
+    assert "Exit status: 0 done; 1 `verify` found something wrong; 2 a mistake" in prefrl.out
 
 
 @pytest.mark.parametrize("line", ["run control/toy --out file", "export labels --to out.jsonl"])

@@ -9,6 +9,8 @@ from prefrl.cli import main
 from prefrl.cli_data import Form, Rows
 from prefrl.label.exchange import EXPORTS
 from prefrl.label.text_rows import FORMS
+from prefrl.store import Store
+from prefrl.types import Response
 
 ROW = {"prompt": "p", "chosen": "a", "rejected": "b", "labeler": "ann"}
 Command = Callable[[str], tuple[int, str]]
@@ -63,3 +65,61 @@ def test_columns_can_be_named_and_bad_rows_left_out(prefrl: Command) -> None:
     assert (code, "row 2: chosen and rejected are the same text" in printed) == (2, True)
     code, printed = prefrl(f"{line} --skip-bad")
     assert (code, "1 judgements read into labels" in printed) == (0, True)
+
+
+def test_an_import_says_what_was_there_already(prefrl: Command) -> None:
+    assert "1 judgements read into labels\n" in prefrl("import in.jsonl --out labels")[1]
+    Path("in.jsonl").write_text("".join(json.dumps(ROW | {"prompt": p}) + "\n" for p in ("p", "q")))
+    assert (
+        "2 judgements would be read into labels: 1 new, 1 there already"
+        in (prefrl("import in.jsonl --out labels --dry-run")[1])
+    )
+    assert "2 judgements read into labels: 1 new, 1 there already" in prefrl("import in.jsonl --out labels")[1]
+
+
+def test_an_export_never_writes_over_a_file_unasked(prefrl: Command) -> None:
+    prefrl("import in.jsonl --out labels")
+    Path("mine.txt").write_text("mine")
+    for form in ("preferences", "bundle"):
+        code, printed = prefrl(f"export labels --to mine.txt --form {form}")
+        assert (code, "mine.txt is there already" in printed, Path("mine.txt").read_text()) == (2, True, "mine")
+    assert prefrl("export labels --to mine.txt --force")[0] == 0
+    assert json.loads(Path("mine.txt").read_text())["chosen"] == "a"
+
+
+def test_an_import_that_fails_leaves_no_store_behind(prefrl: Command) -> None:
+    Path("bad.jsonl").write_text("{}\n")
+    Path("mine").mkdir()
+    Path("mine/notes.txt").write_text("mine")
+    for out in ("new/deeper", "mine"):
+        assert prefrl(f"import bad.jsonl --out {out}")[0] == 2
+    assert not Path("new").exists()
+    assert [path.name for path in Path("mine").iterdir()] == ["notes.txt"]
+    prefrl("import in.jsonl --out labels")
+    assert prefrl("import bad.jsonl --out labels")[0] == 2
+    assert prefrl("verify labels")[0] == 0
+
+
+def test_a_store_that_another_process_is_writing_to_is_not_removed(prefrl: Command) -> None:
+    with Store[Response](Path("labels")):
+        code, printed = prefrl("import in.jsonl --out labels")
+        assert (code, "another process is writing" in printed) == (2, True)
+    assert prefrl("verify labels")[0] == 0
+
+
+@pytest.mark.parametrize("option", ["--skip-bad", "--map prompt=q", "--form arena", "--labelers ann"])
+def test_options_that_a_bundle_would_ignore_are_refused(prefrl: Command, option: str) -> None:
+    prefrl("import in.jsonl --out labels")
+    prefrl("export labels --to bundle --form bundle")
+    for dry in ("", " --dry-run"):
+        code, printed = prefrl(f"import bundle --out copy {option}{dry}")
+        assert (code, "a bundle is read whole" in printed) == (2, True)
+    assert not Path("copy").exists()
+
+
+def test_an_error_is_one_line_however_long_a_path_is(prefrl: Command) -> None:
+    path = "x" * 100 + "/" + "y" * 200 + ".jsonl"
+    Path(path).parent.mkdir()
+    Path(path).write_text("")
+    code, printed = prefrl(f"import {path} --out labels")
+    assert (code, printed.count("\n"), path in printed) == (2, 1, True)

@@ -7,6 +7,7 @@ from stores import fill
 from typer.testing import CliRunner
 
 from prefrl.cli import app
+from prefrl.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Response
 
@@ -54,3 +55,22 @@ def test_an_old_store_is_brought_up_to_date(tmp_path: Path) -> None:
     shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
     assert call("migrate", tmp_path)[1] == f"{tmp_path} has schema 2\n"
     assert call("verify", tmp_path)[0] == 0
+
+
+@pytest.mark.parametrize("args", [(), ("--repair-derived",), ("--salvage", "saved")])
+def test_what_cares_for_a_store_makes_none(tmp_path: Path, args: tuple[str, ...]) -> None:
+    for command in (
+        ["verify", tmp_path, *args],
+        ["backup", tmp_path, "--to", tmp_path / "copy"],
+        ["migrate", tmp_path],
+    ):
+        with pytest.raises(StoreError, match="holds no store"):
+            call(*command)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_database_is_told_and_not_repaired(tmp_path: Path) -> None:
+    (tmp_path / "store.db").write_bytes(b"x" * 4096)
+    with pytest.raises(StoreError, match="cannot be opened"):
+        call("verify", tmp_path, "--repair-derived")
+    assert (tmp_path / "store.db").read_bytes() == b"x" * 4096

@@ -1,20 +1,46 @@
-import shutil
-import sqlite3
+"""What holds of a store on every database that it may be kept in: the same tests on each."""
+
+import contextlib
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from stores import derived, fill, responses
 
 from prefrl.files import DamagedError
-from prefrl.log import StoreError, StoreFull
-from prefrl.maintenance import verify_store
+from prefrl.log import StoreError
+from prefrl.maintenance import backup, verify_store
+from prefrl.projection import dump, rebuild
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 
 Ask = Callable[..., Query[Segment]]
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A folder for a new store, whose log is kept in one database or the other."""
+    folder = tmp_path / "store"
+    folder.mkdir()
+    if request.param == "postgresql":
+        (folder / "store.url").write_text(f"{request.getfixturevalue('postgres_url')}\n")
+    return folder
+
+
+@pytest.fixture
+def store(folder: Path) -> Iterator[Store[Segment]]:
+    with Store[Segment](folder) as opened:
+        yield opened
+
+
+@pytest.fixture
+def text_store(folder: Path) -> Iterator[Store[Response]]:
+    with Store[Response](folder) as opened:
+        yield opened
 
 
 def test_what_was_asked_and_answered_is_there_after_reopening(store: Store[Segment], make_query: Ask) -> None:
@@ -102,16 +128,6 @@ def test_an_answer_that_fits_no_query_is_refused(
     assert store.judged() == []  # all or none
 
 
-def test_the_log_cannot_be_changed(store: Store[Segment], make_query: Ask) -> None:
-    store.ask([make_query()])
-    store.close()
-    with sqlite3.connect(store.folder / "store.db") as connection:
-        for statement in ("UPDATE event SET body = '{}'", "DELETE FROM event"):
-            with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-                connection.execute(statement)
-    connection.close()
-
-
 def test_one_may_read_while_another_writes(store: Store[Segment], make_query: Ask) -> None:
     with Store[Segment](store.folder, write=False) as reader:
         store.ask([query := make_query()])
@@ -128,42 +144,6 @@ def test_a_second_writer_is_told_who_holds_the_store(store: Store[Segment]) -> N
     assert '"pid"' in done.stderr
 
 
-def test_every_answer_is_on_disk_when_the_process_is_killed(tmp_path: Path) -> None:
-    code = f"""
-import os, signal, numpy as np
-from pathlib import Path
-from prefrl.maintenance import verify_store
-from prefrl.store import Store
-from prefrl.types import *
-store = Store(Path({str(tmp_path)!r}))
-for i in range(5):
-    q = Query((Response("p", f"a{{i}}"), Response("p", f"b{{i}}")))
-    store.ask([q]); store.answer([Comparison(q.id, 1.0)])
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    subprocess.run([sys.executable, "-c", code], check=False)
-    with Store[Response](tmp_path) as store:  # the lock of a dead process does not bind
-        assert store.counts()["answered"] == 5
-
-
-def test_a_store_from_a_newer_version_is_refused(store: Store[Segment]) -> None:
-    store.close()
-    with sqlite3.connect(store.folder / "store.db") as connection:
-        connection.execute("UPDATE meta SET value = '99'")
-    connection.close()
-    with pytest.raises(StoreError, match="newer prefrl"):
-        Store[Segment](store.folder)
-
-
-def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "store.db").write_bytes(b"x" * 4096)
-    with pytest.raises(StoreError, match="cannot be opened"):
-        Store[Segment](tmp_path)
-    (tmp_path / "store.db").unlink()
-    with pytest.raises(StoreError, match="holds no store"):
-        Store[Segment](tmp_path, write=False)
-
-
 def test_a_changed_or_missing_blob_is_noticed(store: Store[Segment], make_query: Ask) -> None:
     query, other = make_query(), make_query()
     store.ask([query, other])
@@ -178,85 +158,74 @@ def test_a_changed_or_missing_blob_is_noticed(store: Store[Segment], make_query:
             again.query(other.id)
 
 
-def test_any_database_will_do(tmp_path: Path, make_query: Ask) -> None:
-    with Store[Segment](tmp_path, url=f"sqlite:///{tmp_path / 'other.db'}") as store:
-        store.ask([make_query()])
-        assert store.counts()["asked"] == 1
-
-
-def test_a_full_disk_is_an_error_and_loses_nothing(store: Store[Segment], make_query: Ask) -> None:
-    kept = make_query()
-    store.ask([kept])
-    assert store.log._writer is not None
-    with store.log._writer.connect() as connection:
-        pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
-        connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
-    late = [make_query() for _ in range(200)]
-    with pytest.raises(StoreFull, match="is full"):
-        store.ask(late)
-    assert [q.id for q in store.open_queries()] == [kept.id]
-    with store.log._writer.connect() as connection:
-        connection.exec_driver_sql("PRAGMA max_page_count=1000000")
-    store.ask(late)  # there is room again
-    assert len(store.open_queries()) == 201
-
-
 def test_of_two_answers_given_at_once_the_first_stands(store: Store[Segment], make_query: Ask) -> None:
     store.ask([query := make_query()])
     store.answer([Comparison(query.id, 1.0, "me"), Comparison(query.id, 0.0, "me")])
     assert store.judged()[0].judgement == Comparison(query.id, 1.0, "me")
 
 
-def test_a_store_of_the_first_version_is_brought_up_to_date_after_a_copy(tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
-    with pytest.raises(StoreError, match="made by an older prefrl"):
-        Store[Response](tmp_path, write=False)
-    with Store[Response](tmp_path) as store:
-        assert store.counts() == {"asked": 4, "answered": 5, "skipped": 2}
-        assert store.sequence == 23
-        assert {(j.judgement.labeler, type(j.judgement).__name__) for j in store.judged()} == {
-            ("ann", "Ranking"),
-            ("ann", "Comparison"),
-            ("bob", "Comparison"),
-            ("bob", "Choice"),
-            ("bob", "Rating"),
-        }
-    assert verify_store(tmp_path).faults == []
-    (copy,) = (tmp_path / "backups").iterdir()
-    with sqlite3.connect(copy) as connection:
-        assert connection.execute("SELECT value FROM meta WHERE key = 'schema'").fetchall() == [("1",)]
-    connection.close()
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from prefrl.store import Store
+from prefrl.types import *
+store = Store(Path(sys.argv[1]))
+for i in range(5):
+    q = Query((Response("p", f"a{i}"), Response("p", f"b{i}")))
+    store.ask([q]); store.answer([Comparison(q.id, 1.0)])
+os.kill(os.getpid(), signal.SIGKILL)
+"""
 
 
-def test_migrations_make_the_tables_that_new_stores_have(tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
-    Store[Response](tmp_path).close()
-    Store[Response](tmp_path / "new").close()
-
-    def described(path: Path) -> set[tuple[str, str, str]]:
-        with sqlite3.connect(path) as connection:
-            of_ours = "SELECT type, name, tbl_name FROM sqlite_master WHERE name <> 'sqlite_sequence'"
-            rows = connection.execute(of_ours).fetchall()
-        connection.close()
-        return set(rows)
-
-    assert described(tmp_path / "store.db") == described(tmp_path / "new" / "store.db")
+def test_every_answer_is_on_disk_when_the_process_is_killed(folder: Path) -> None:
+    subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False)
+    with opened_soon(folder) as store:  # the lock of a dead process does not bind
+        assert store.counts()["answered"] == 5
 
 
-def test_a_disk_that_fills_up_inside_a_savepoint_is_said_to_be_full(text_store: Store[Response]) -> None:
-    queries = [Query((Response(f"p{i}", "a"), Response(f"p{i}", "b"))) for i in range(400)]
+def opened_soon(folder: Path) -> Store[Response]:
+    """A server may take a moment to notice that a process is gone."""
+    for _ in range(50):
+        with contextlib.suppress(StoreError):
+            return Store[Response](folder)
+        time.sleep(0.1)
+    return Store[Response](folder)
+
+
+def test_derived_tables_are_the_same_when_written_again(text_store: Store[Response]) -> None:
+    fill(text_store)
+    before = derived(text_store.folder)
+    with text_store.log.transaction() as tx:
+        rebuild(tx.connection)
+    with text_store.log.reading() as connection:
+        assert list(dump(connection)) == before
+
+
+def test_a_transaction_that_fails_leaves_nothing(text_store: Store[Response]) -> None:
+    first, second = responses(2)
+    text_store.ask([first])
+    with pytest.raises(StoreError, match="never asked"):
+        text_store.answer([Comparison(first.id, 1.0), Comparison(second.id, 1.0)])
+    with text_store.log.transaction() as tx:
+        text_store.put(tx, Comparison(first.id, 1.0, "a"), {})
+        with contextlib.suppress(StoreError), tx.savepoint():
+            text_store.put(tx, Comparison(first.id, 1.0, "b"), {})
+            raise StoreError("no")
+    assert [a.labeler for a in text_store.answers()] == ["a"]
+    assert verify_store(text_store.folder).ok
+
+
+def test_a_store_verifies_and_is_copied_while_it_is_open(text_store: Store[Response], tmp_path: Path) -> None:
+    fill(text_store)
+    assert backup(text_store.folder, tmp_path / "copy") == verify_store(text_store.folder).events
+    assert verify_store(tmp_path / "copy").ok
+
+
+def test_progress_counts_queries_however_many_people_answer(text_store: Store[Response]) -> None:
+    queries = responses(4)
     text_store.ask(queries)
-    assert text_store.log._writer is not None
-    with text_store.log._writer.connect() as connection:
-        pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
-        connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
-
-    def fill() -> None:
-        with text_store.log.transaction() as tx:
-            for query in queries:
-                with tx.savepoint():
-                    text_store.put(tx, Comparison(query.id, 1.0), {"comment": "x" * 500})
-
-    with pytest.raises(StoreFull, match="is full"):
-        fill()
-    assert text_store.judged() == []
+    text_store.ask(responses(1, 3), "check", [0])
+    text_store.answer([Comparison(queries[0].id, 1.0, who) for who in ("a", "b", "c")])
+    text_store.answer([Skip(queries[0].id, "skip", "d"), Skip(queries[1].id, "skip", "d")])
+    text_store.answer([Skip(queries[1].id, "incomparable", "e"), Skip(queries[2].id, "incomparable", "e")])
+    assert text_store.progress() == (4, 1, 2)

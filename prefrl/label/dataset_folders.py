@@ -15,6 +15,7 @@ from typing import Any
 from prefrl.label.formats import Layout, Parts, Row
 from prefrl.label.reading import list_files, refuse_links
 from prefrl.label.text_rows import text_rows
+from prefrl.log import has_store
 
 PATTERNS = (("*.parquet",), ("*.jsonl", "*.jsonl.gz"), ("*.json", "*.json.gz"), ("*.csv", "*.csv.gz"))
 SPLITS = re.compile(r"(train|test|validation|valid|dev|eval)(?=[-_.]|\Z)")
@@ -40,7 +41,7 @@ def _in_split(parse: Any, split: str) -> Sequence[Row | str]:
 def _files(folder: Path) -> Iterator[tuple[Path, str]]:
     """(file, split), those of the kind alone that the folder is made of."""
     refuse_links(folder)
-    if (folder / "store.db").exists():
+    if has_store(folder):
         raise ValueError(f"{folder} is a store itself: read what `prefrl export --form bundle` makes of it")
     if (folder / OURS).exists():
         yield from ((path, "") for path in list_files(folder / JUDGEMENTS, ["*.parquet"]))

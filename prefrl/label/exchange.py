@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sql
 
+from prefrl.arrivals import Against, otherwise
 from prefrl.blobs import write_arrays
-from prefrl.events import PORTABLE, describe, read_answer
-from prefrl.files import MANIFEST, verify, whole_folder, write_file
+from prefrl.events import describe, read_answer
+from prefrl.label.bundles import export_bundle, import_bundle, is_bundle, try_bundle
 from prefrl.label.exports.dataset import export_dataset
-from prefrl.label.exports.given import Exported, json_text, whole_file
+from prefrl.label.exports.given import Exported
 from prefrl.label.exports.minari import export_minari
 from prefrl.label.exports.rows import export_judgements, export_preferences, export_unpaired
 from prefrl.label.exports.table import export_csv
 from prefrl.label.exports.tools import export_arena, export_argilla, export_label_studio
 from prefrl.label.formats import Layout, Row, Which, check_file
-from prefrl.label.reading import parse_json, read_lines, refuse_links
+from prefrl.label.recognition import recognised
 from prefrl.log import StoreError, Transaction, row
-from prefrl.projection import ANSWERS, CHUNK, RETRACTED, chunks, words
+from prefrl.projection import CHUNK, RETRACTED, chunks, words
 from prefrl.store import Store
 from prefrl.tables import event
-from prefrl.types import Candidate, Segment
-
-EVENTS = "events.jsonl"
-FIELDS = ("id", "kind", "subject", "actor", "body", "at")
-"""What of an event goes from store to store; its number and its hash are each store's own."""
+from prefrl.types import Answer, Candidate, Segment
 
 
 @dataclass(frozen=True)
@@ -39,33 +34,11 @@ class Imported:
 
     read: int
     notes: tuple[str, ...] = ()
+    known: int = 0
+    """How many of them the store had already."""
 
 
 # --- out ----------------------------------------------------------------------------------------------------------
-
-
-def export_bundle(store: Store[Any], path: Path) -> Exported:
-    """Write a folder with every event and every array; the same store gives the same bytes.
-
-    Gold stays out, and so do names of people who have not answered, their access, and settings of the project.
-    """
-    left, answers = 0, 0
-    with whole_folder(path) as work:
-        with whole_file(work / EVENTS) as file:
-            for one in store.events():
-                left += one["kind"] not in PORTABLE
-                answers += one["kind"] in ANSWERS
-                if one["kind"] in PORTABLE:
-                    file.write(f"{_event_text(one)}\n".encode())
-        for blob in sorted((store.folder / "blobs").rglob("*.safetensors")):
-            write_file(work / blob.relative_to(store.folder), blob.read_bytes())
-    note = "the gold stays where it is, and so do secrets that let people in"
-    return Exported(answers, {"event about people's access or the project's settings": left} if left else {}, (note,))
-
-
-def _event_text(one: Mapping[str, Any]) -> str:
-    body = json.loads(json.dumps(one["body"], sort_keys=True))
-    return json_text({name: body if name == "body" else one[name] for name in FIELDS})
 
 
 EXPORTS: Mapping[str, Callable[[Store[Any], Path, str], Exported]] = {
@@ -95,11 +68,6 @@ def export(store: Store[Any], path: Path, form: str = "preferences", ties: str =
 # --- in -----------------------------------------------------------------------------------------------------------
 
 
-def is_bundle(path: Path) -> bool:
-    """Whether a folder holds the events of a store."""
-    return path.is_dir() and (path / EVENTS).exists()
-
-
 def import_judgements(
     path: Path, store: Store[Any], which: Which | None = None, layout: Layout | None = None
 ) -> Imported:
@@ -109,15 +77,17 @@ def import_judgements(
     store holds another judgement of the same query by a labeler of the same name.
     """
     if is_bundle(path):
-        _refuse_choice(path, which)
-        return Imported(import_bundle(path, store))
-    checked, count = check_file(path, which, layout), 0
+        _refuse_choice(path, which, layout)
+        read, known = import_bundle(path, store)
+        return Imported(read, (), known)
+    checked, arrived = check_file(path, which, layout), _Arrived(path, store)
     with store.log.transaction() as tx:
         for some in chunks(checked.rows(), CHUNK):
-            _check(path, store, tx.connection, some)
-            _put(store, tx, some)
-            count += len(some)
-    return Imported(count, checked.notes)
+            new = arrived.compare(tx.connection, some)
+            if not arrived.against.count:
+                _put(store, tx, new)
+        arrived.against.refuse(path)
+    return Imported(arrived.read, checked.notes, arrived.known)
 
 
 def try_import(
@@ -125,35 +95,58 @@ def try_import(
 ) -> Imported:
     """What `import_judgements` would do, by the same checks, with nothing written. A store may be open for reading."""
     if is_bundle(path):
-        _refuse_choice(path, which)
-        with tempfile.TemporaryDirectory() as scratch, Store[Any](Path(scratch)) as empty:
-            return Imported(import_bundle(path, empty))
-    checked, count = check_file(path, which, layout), 0
-    for some in chunks(checked.rows(), CHUNK):
-        if store is not None:
-            with store.log.reading() as connection:
-                _check(path, store, connection, some)
-        count += len(some)
-    return Imported(count, checked.notes)
+        _refuse_choice(path, which, layout)
+        read, known = try_bundle(path, store)
+        return Imported(read, (), known)
+    checked = check_file(path, which, layout)
+    if store is None:
+        return Imported(sum(1 for _ in checked.rows()), checked.notes)
+    arrived = _Arrived(path, store)
+    with store.log.reading() as connection:
+        for some in chunks(checked.rows(), CHUNK):
+            arrived.compare(connection, some)
+    arrived.against.refuse(path)
+    return Imported(arrived.read, checked.notes, arrived.known)
 
 
-def _refuse_choice(path: Path, which: Which | None) -> None:
+def _refuse_choice(path: Path, which: Which | None, layout: Layout | None) -> None:
+    """A bundle is read whole, or not at all."""
     if which and (which.labelers or which.split):
         raise ValueError(f"{path}: a bundle is read whole; choose labelers when you fit")
+    if layout and layout != Layout():
+        raise ValueError(f"{path}: a bundle is read whole, as it is: --form, --map and --skip-bad are for other files")
 
 
-def _check(path: Path, store: Store[Any], connection: sql.Connection, some: Sequence[Row]) -> None:
-    """Raise `StoreError` where answers do not fit what a store holds."""
-    held = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
-    if held is not None and (kind := describe(some[0].query.candidates[0])["type"]) != held["type"]:
-        raise StoreError(f"{store.folder} holds {held['type']}s, and cannot hold the {kind}s of {path}")
-    answers = {(one.answer.query, one.answer.labeler): one.answer for one in some}
+class _Arrived:
+    """Rows of a file beside what a store holds."""
+
+    def __init__(self, path: Path, store: Store[Any]) -> None:
+        self.path, self.store = path, store
+        self.read = self.known = 0
+        self.against = Against()
+
+    def compare(self, connection: sql.Connection, some: Sequence[Row]) -> list[Row]:
+        """The rows as answers to the store's own queries where they come from these."""
+        self._check_kind(connection, some[0])
+        found = recognised(connection, some, self.store.folder / "blobs")
+        answers = {(one.answer.query, one.answer.labeler): one.answer for one in found}
+        there = list(_standing(connection, answers))
+        self.against.add(otherwise(answers[stands.query, stands.labeler], stands) for stands in there)
+        self.read, self.known = self.read + len(found), self.known + len(there)
+        return found
+
+    def _check_kind(self, connection: sql.Connection, first: Row) -> None:
+        """Raise `StoreError` where the store's candidates are of another kind."""
+        held = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
+        if held is not None and (kind := describe(first.query.candidates[0])["type"]) != held["type"]:
+            raise StoreError(f"{self.store.folder} holds {held['type']}s, and cannot hold the {kind}s of {self.path}")
+
+
+def _standing(connection: sql.Connection, answers: Mapping[tuple[str, str], Answer]) -> Iterator[Answer]:
+    """What stands in a store of the same labelers on the same queries."""
     there = {word["seq"] for word in words(connection, answers).values() if word["kind"] != RETRACTED}
     for one in connection.execute(sql.select(event).where(event.c.seq.in_(there))):
-        stands = read_answer(one.kind, one.subject, one.actor, one.body)
-        if answers[one.subject, one.actor] != stands:
-            who = f"{one.actor!r} has judged query {one.subject[:12]} otherwise before: {stands}"
-            raise StoreError(f"{path}: {who}")
+        yield read_answer(one.kind, one.subject, one.actor, one.body)
 
 
 def _put(store: Store[Any], tx: Transaction, some: Sequence[Row]) -> None:
@@ -167,36 +160,6 @@ def _put(store: Store[Any], tx: Transaction, some: Sequence[Row]) -> None:
     asked = {one.query.id: [c.id for c in one.query.candidates] for one in some}
     tx.extend([row(id, "query", body={"candidates": ids, "batch": tx.seq}) for id, ids in asked.items()])
     store.put_all(tx, [one.answer for one in some])
-
-
-def import_bundle(path: Path, store: Store[Any]) -> int:
-    """Read a folder that `export_bundle` wrote, all or none; what the store has already is left alone."""
-    refuse_links(path)
-    _check_names(path)
-    verify(path)
-    return store.merge(_events(path / EVENTS), path / "blobs")
-
-
-def _check_names(path: Path) -> None:
-    """Raise `ValueError` unless the manifest names the events, and nothing outside the folder."""
-    try:
-        names = json.loads((path / MANIFEST).read_text())
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path} is no whole bundle: {MANIFEST} cannot be read: {error}") from None
-    if not isinstance(names, dict) or EVENTS not in names:
-        raise ValueError(f"{path} is no whole bundle: {MANIFEST} does not name {EVENTS}")
-    for name in names:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name:
-            raise ValueError(f"{path}: {MANIFEST} names {name!r}, which lies outside: refused")
-
-
-def _events(path: Path) -> Iterator[dict[str, Any]]:
-    for number, line in enumerate(read_lines(path), 1):
-        try:
-            one = parse_json(line)
-            yield {name: one[name] for name in FIELDS}
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: row {number} is no event: {error!r}") from None
 
 
 __all__ = [

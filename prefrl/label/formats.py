@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from prefrl.label.reading import TABLES, list_files
-from prefrl.types import Answer, Judged, Query, Skip
+from prefrl.types import Answer, Judged, Query, Skip, person
 
 SHOWN_ERRORS = 20
 SHOWN_REPEATS = 5
@@ -28,6 +28,10 @@ class Row(NamedTuple):
     """Its labeler is "" where the file names none."""
     split: str = ""
     """The part of the data that the file puts it into; "" where it says nothing."""
+    named: str = ""
+    """The query of a store that it was written from; "" where the file names none."""
+    there: str = ""
+    """Its labeler, numbered among the answers to the query that is named."""
 
     @property
     def judged(self) -> Judged[Any]:
@@ -77,7 +81,7 @@ class Which:
 
     def takes(self, labeler: str) -> bool:
         """Whether a labeler's judgements count; "human#2" gave the second judgement of "human" on the same query."""
-        return not self.labelers or labeler.partition("#")[0] in self.labelers
+        return not self.labelers or person(labeler) in self.labelers
 
 
 @dataclass(frozen=True)
@@ -138,13 +142,11 @@ def check_file(path: Path, which: Which | None = None, layout: Layout | None = N
         else:
             found.take(place, parsed)
     notes = found.told(path, layout.skip_bad)
-    labelers = {who.partition("#")[0] for who, _ in found.counts}
+    labelers = {person(who) for who, _ in found.counts}
     if not which.labelers and {HUMAN, SCRIPT} <= labelers:
         which = replace(which, labelers=tuple(labelers - {SCRIPT}))
         scripted = sum(
-            n
-            for (who, split), n in found.counts.items()
-            if who.partition("#")[0] == SCRIPT and which.split in ("", split)
+            n for (who, split), n in found.counts.items() if person(who) == SCRIPT and which.split in ("", split)
         )
         notes += _told(Counter({"label by a script (--labelers script reads it)": scripted}))
     if not any(which.takes(who) and which.split in ("", split) for who, split in found.counts):
@@ -226,20 +228,29 @@ def _digest(path: Path) -> str:
 
 
 def _key(row: Row, default: str) -> bytes:
-    return hashlib.sha256(f"{row.query.id}:{row.answer.labeler or default}".encode("utf-8", "surrogatepass")).digest()
+    return _digested(f"{row.query.id}:{row.answer.labeler or default}")
+
+
+def _digested(text: str) -> bytes:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()
 
 
 def _numbered(row: Row, default: str, seen: Counter[bytes]) -> Row:
     """A row with a labeler; one's second judgement of a query is by "NAME#2": a store keeps one a name."""
-    key, who = _key(row, default), row.answer.labeler or default
+    who = row.answer.labeler or default
+    there = _name(who, _digested(f"{row.named} {who}"), seen) if row.named else ""
+    return row._replace(answer=replace(row.answer, labeler=_name(who, _key(row, default), seen)), there=there)
+
+
+def _name(who: str, key: bytes, seen: Counter[bytes]) -> str:
     seen[key] += 1
-    return row._replace(answer=replace(row.answer, labeler=f"{who}#{seen[key]}" if seen[key] > 1 else who))
+    return f"{who}#{seen[key]}" if seen[key] > 1 else who
 
 
 def _nothing(counts: Iterable[tuple[str, str]], which: Which) -> str:
     """Why nothing was chosen, and what there is to choose from."""
     wanted = " and ".join([*which.labelers, *([f"split {which.split!r}"] if which.split else [])])
-    labelers = ", ".join(sorted({who.partition("#")[0] for who, _ in counts}))
+    labelers = ", ".join(sorted({person(who) for who, _ in counts}))
     splits = ", ".join(sorted({split for _, split in counts} - {""})) or "none"
     return f"no judgement by or in {wanted}; labelers there: {labelers}; splits there: {splits}"
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from prefrl.events import check_answer, is_whole
 from prefrl.label.formats import Row
-from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip, check_fits
+from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
 
 VERDICTS = ("ranks", "best", "ratings", "preference", "skip")
 """Columns of which one says the answer."""
@@ -36,8 +37,9 @@ def answered(row: Mapping[str, Any], candidates: Sequence[Any], verdict: Callabl
         "weight": number(row, "weight", 1.0),
     }
     answer = verdict(query=query.id, order=order, who=who)
-    check_fits(answer, len(candidates))
-    return Row(query, answer, optional(row, "split", str, ""))
+    check_answer(answer, len(candidates))
+    named = row.get("query")  # in files of others this may be anything
+    return Row(query, answer, optional(row, "split", str, ""), named if isinstance(named, str) else "")
 
 
 def responses(prompt: str, texts: Sequence[str]) -> list[Response]:
@@ -50,11 +52,7 @@ def _shown(row: Mapping[str, Any], order: Sequence[int]) -> tuple[int, ...]:
     shown = row.get("shown")
     if not shown:
         return ()
-    if (
-        not isinstance(shown, list)
-        or any(isinstance(i, bool) for i in shown)
-        or sorted(map(str, shown)) != sorted(map(str, range(len(order))))
-    ):
+    if not isinstance(shown, list) or not all(map(is_whole, shown)) or sorted(shown) != list(range(len(order))):
         raise ValueError(f"column 'shown': expected each of 0 to {len(order) - 1} once, got {shown!r:.200}")
     return tuple(order[i] for i in shown)
 

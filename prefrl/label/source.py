@@ -12,7 +12,7 @@ from prefrl.label.exchange import import_judgements
 from prefrl.label.formats import Which
 from prefrl.projection import ANSWERS
 from prefrl.store import Store
-from prefrl.types import Judged, Segment
+from prefrl.types import Judged, Segment, person
 
 
 class Opened(NamedTuple):
@@ -47,14 +47,20 @@ def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
     if which.split:
         raise ValueError(f"{source} is a store, which knows no split: give a file, or leave the split out")
     with Store[Any](source, write=False) as whole:
-        events = list(whole.events())
-    asked = [e for e in events if e["kind"] in ("candidate", "query")]
-    answers = [e for e in events if e["kind"] in (*ANSWERS, "retract") and which.takes(e["actor"])]
-    if not answers:
-        known = ", ".join(sorted({e["actor"].partition("#")[0] for e in events} - {""})) or "none"
-        raise ValueError(f"{source}: no judgement by {', '.join(which.labelers)}; labelers there: {known}")
-    store.merge(asked + answers, source / "blobs")
+        names = {e["actor"] for e in whole.events() if e["kind"] in ANSWERS}
+        if not any(map(which.takes, names)):
+            known = ", ".join(sorted(set(map(person, names)) - {""})) or "none"
+            raise ValueError(f"{source}: no judgement by {', '.join(which.labelers)}; labelers there: {known}")
+        store.merge(lambda: _events(whole, which), source / "blobs")
     return Opened(store, ())
+
+
+def _events(store: Store[Any], which: Which) -> Iterator[dict[str, Any]]:
+    """What was asked, and what those have said of it who are wanted."""
+    for one in store.events():
+        said = one["kind"] in (*ANSWERS, "retract") and which.takes(one["actor"])
+        if said or one["kind"] in ("candidate", "query"):
+            yield one
 
 
 def check_candidates(judged: Sequence[Judged[Any]], task: Any) -> None:

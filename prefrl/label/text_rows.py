@@ -180,7 +180,7 @@ def _good(level: int, query: str, order: Sequence[int], who: dict[str, Any]) -> 
 
 
 def _several(row: Mapping[str, Any]) -> Row:
-    texts = row["responses"]
+    texts = row.get("responses")
     if not isinstance(row.get("prompt"), str) or not isinstance(texts, list):
         raise ValueError(f'expected "prompt": string and "responses": list, got {row!r:.200}')
     if not all(isinstance(text, str) for text in texts):
@@ -192,16 +192,16 @@ def _several(row: Mapping[str, Any]) -> Row:
 
 
 def _trees(row: Mapping[str, Any]) -> list[Row | str]:
-    return _tree(row["prompt"], optional(row, "split", str, ""))
+    return _tree(row.get("prompt"), optional(row, "split", str, ""))
 
 
-def _tree(root: Mapping[str, Any], split: str) -> list[Row | str]:
+def _tree(root: Any, split: str) -> list[Row | str]:
     """A ranking for each group of ranked replies to one conversation so far."""
     found: list[Row | str] = []
     waiting = [(root, "")]
     while waiting:
         message, before = waiting.pop()
-        if message.get("role") not in TREE_ROLES or not isinstance(message.get("text"), str):
+        if not _is_message(message):
             raise ValueError(
                 f"expected a message with a text and a role ({', '.join(TREE_ROLES)}), got {message!r:.200}"
             )
@@ -211,6 +211,11 @@ def _tree(root: Mapping[str, Any], split: str) -> list[Row | str]:
             found += _group(here + CUE, replies, split)
         waiting += [(reply, here) for reply in reversed(replies)]
     return found
+
+
+def _is_message(value: Any) -> bool:
+    known = isinstance(value, Mapping) and value.get("role") in TREE_ROLES and isinstance(value.get("text"), str)
+    return known and isinstance(value.get("replies") or [], list)
 
 
 def _group(prompt: str, replies: Sequence[Mapping[str, Any]], split: str) -> list[Row | str]:

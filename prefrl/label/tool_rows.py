@@ -25,6 +25,17 @@ def _row(verdict: str, value: Any, prompt: str, texts: Sequence[str], labeler: s
     return answer_of({"labeler": labeler, verdict: value}, responses(prompt, texts))
 
 
+def _written_from(found: Sequence[Row | str], query: Any) -> list[Row | str]:
+    """The rows, as written from a query of a store if that is what is named."""
+    return [one._replace(named=query) if isinstance(one, Row) and isinstance(query, str) else one for one in found]
+
+
+def _object(row: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    if not isinstance(found := row.get(name), Mapping):
+        raise ValueError(f"column {name!r}: expected an object, got {found!r:.200}")
+    return found
+
+
 # --- Argilla ------------------------------------------------------------------------------------------------------
 
 
@@ -34,7 +45,7 @@ def _argilla(record: Mapping[str, Any]) -> list[Row | str]:
     The responses to compare are the fields that a question's answers name, or all fields but the prompt. An answer is
     the name of a field, "tie", "incomparable", or an order of names.
     """
-    prompt, texts = _fields(record["fields"])
+    prompt, texts = _fields(_object(record, "fields"))
     given = record.get("responses") or {}
     if not isinstance(given, Mapping):
         raise ValueError(f'expected "responses": question -> list, got {given!r:.200}')
@@ -43,7 +54,7 @@ def _argilla(record: Mapping[str, Any]) -> list[Row | str]:
     for question, answers in given.items():
         for answer in answers if isinstance(answers, list) else []:
             found.append(_argilla_answer(question, answer, prompt, texts, names))
-    return found or ["record without a response"]
+    return _written_from(found, record.get("id")) or ["record without a response"]
 
 
 def user_id(labeler: str) -> str:
@@ -124,11 +135,15 @@ def _label_studio(task: Mapping[str, Any]) -> list[Row | str]:
 
     An annotation that was cancelled is a skip.
     """
-    prompt, texts = _task(task["data"])
-    annotations = task["annotations"]
+    prompt, texts = _task(_object(task, "data"))
+    annotations = task.get("annotations")
     if not isinstance(annotations, list):
         raise ValueError(f'expected "annotations": list, got {annotations!r:.200}')
-    return [_annotation(one, prompt, texts) for one in annotations] or ["task without an annotation"]
+    found = [_annotation(one, prompt, texts) for one in annotations]
+    meta = task.get("meta")
+    return _written_from(found, meta.get("query") if isinstance(meta, Mapping) else "") or [
+        "task without an annotation"
+    ]
 
 
 def _task(data: Mapping[str, Any]) -> tuple[str, list[str]]:
@@ -181,10 +196,12 @@ def _arena(battle: Mapping[str, Any]) -> list[Row | str]:
     prompt, *texts = split_conversations(a, b)
     winner, labeler = battle.get("winner"), optional(battle, "judge", str, "")
     if winner == "tie (bothbad)":
-        return [_row("skip", "incomparable", prompt, texts, labeler)]
-    if winner not in _WINNERS:
+        found = _row("skip", "incomparable", prompt, texts, labeler)
+    elif isinstance(winner, str) and winner in _WINNERS:
+        found = _row("preference", _WINNERS[winner], prompt, texts, labeler)
+    else:
         raise ValueError(f"winner: expected {', '.join(_WINNERS)} or tie (bothbad), got {winner!r:.200}")
-    return [_row("preference", _WINNERS[winner], prompt, texts, labeler)]
+    return _written_from([found], battle.get("question_id"))
 
 
 _WINNERS = {"model_a": 1.0, "model_b": 0.0, "tie": 0.5}

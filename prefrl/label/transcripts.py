@@ -23,7 +23,8 @@ def read_messages(value: Any) -> Messages:
         raise ValueError(f"expected a list of messages, got {value!r:.200}")
     found = []
     for one in value:
-        fits = isinstance(one, Mapping) and one.get("role") in SPEAKERS and isinstance(one.get("content"), str)
+        told = isinstance(one, Mapping) and isinstance(one.get("role"), str) and isinstance(one.get("content"), str)
+        fits = told and one["role"] in SPEAKERS
         if not fits:
             roles = ", ".join(SPEAKERS)
             raise ValueError(f"expected messages with a role ({roles}) and content that is text, got {one!r:.200}")

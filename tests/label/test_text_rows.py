@@ -174,3 +174,11 @@ def test_an_import_that_fails_late_leaves_nothing(tmp_path: Path, text_store: St
     with pytest.raises(StoreError, match="otherwise before"):
         import_judgements(lines(tmp_path / "y.jsonl", *many, last), text_store)
     assert text_store.sequence == before
+
+
+@pytest.mark.parametrize("form", ["responses", "tree", "argilla", "label-studio", "arena"])
+@pytest.mark.parametrize("value", [None, 1, "x", []])
+def test_a_row_that_is_not_of_the_form_that_was_named_is_a_mistake_in_a_row(form: str, value: Any) -> None:
+    names = ("prompt", "responses", "fields", "data", "annotations", "conversation_a", "winner")
+    with pytest.raises(ValueError):
+        parse(dict.fromkeys(names, value), Layout(form))

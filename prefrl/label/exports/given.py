@@ -20,7 +20,7 @@ from prefrl.files import make_folder, sync_folder
 from prefrl.log import StoreError
 from prefrl.projection import ANSWERS, CHUNK, all_events, chunks, words
 from prefrl.store import Store
-from prefrl.tables import event
+from prefrl.tables import event, standing
 from prefrl.tables import query as asked
 from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
 
@@ -72,10 +72,31 @@ def each_answer(store: Store[Any]) -> Iterator[Given]:
     """Every answer that stands, oldest first, skips included, those to check questions not; few in memory at a time."""
     with store.log.reading() as connection:
         for some in _standing(connection):
-            queries = _queries(connection, {e["subject"] for e in some}, store.folder / "blobs")
+            queries = stored_queries(connection, {e["subject"] for e in some}, store.folder / "blobs")
             for e in some:
                 answer = read_answer(e["kind"], e["subject"], e["actor"], e["body"])
                 yield Given(e["at"], answer, queries[e["subject"]], e["body"].get("about") or {})
+
+
+def each_query(store: Store[Any]) -> Iterator[list[Given]]:
+    """The answers to each query that stand, in the order in which the queries were first answered; few in memory."""
+    seen = set[str]()
+    with store.log.reading() as connection:
+        for some in _standing(connection):
+            new = [id for id in dict.fromkeys(e["subject"] for e in some) if id not in seen]
+            seen.update(new)
+            queries = stored_queries(connection, new, store.folder / "blobs")
+            found: dict[str, list[Given]] = {id: [] for id in new}
+            for e in _answers_to(connection, new):
+                answer = read_answer(e.kind, e.subject, e.actor, e.body)
+                found[e.subject].append(Given(e.at, answer, queries[e.subject], e.body.get("about") or {}))
+            yield from found.values()
+
+
+def _answers_to(connection: sql.Connection, ids: Collection[str]) -> Iterator[sql.Row[Any]]:
+    """The events of the answers to some queries that stand, oldest first."""
+    some = sql.select(event).join(standing, standing.c.seq == event.c.seq).where(standing.c.query.in_(ids))
+    yield from connection.execute(some.where(event.c.kind.in_(ANSWERS)).order_by(event.c.seq))
 
 
 def knows_strengths(store: Store[Any]) -> bool:
@@ -94,7 +115,7 @@ def _standing(connection: sql.Connection) -> Iterator[list[dict[str, Any]]]:
         yield [e for e in some if newest[e["subject"], e["actor"]]["seq"] == e["seq"] and e["subject"] in labels]
 
 
-def _queries(connection: sql.Connection, ids: Collection[str], blobs: Path) -> dict[str, Query[Any]]:
+def stored_queries(connection: sql.Connection, ids: Collection[str], blobs: Path) -> dict[str, Query[Any]]:
     """Queries by id. Not the store's own, which keeps all that it was ever asked for."""
     queries = _bodies(connection, ids)
     found = _bodies(connection, {c for body in queries.values() for c in body["candidates"]})

@@ -105,4 +105,5 @@ def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
 def _labels(store: Store[Any], tally: Tally, episodes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
     for given in each_answer(store):
         tally.note(given)
-        yield {"episodes": [episodes[c.id] for c in given.query.candidates]} | told(given)
+        compared = {"query": given.query.id, "episodes": [episodes[c.id] for c in given.query.candidates]}
+        yield compared | told(given)

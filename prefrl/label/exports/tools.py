@@ -17,6 +17,7 @@ from prefrl.label.exports.given import (
     Given,
     Tally,
     each_answer,
+    each_query,
     refuse_segments,
     write_lines,
     write_list,
@@ -32,12 +33,11 @@ SOME_RATING = "rating, for which records hold no question"
 
 def _by_query(store: Store[Any], tally: Tally, form: str) -> Iterator[list[Given]]:
     """The answers to each query, in the order in which the queries were first answered."""
-    found: dict[str, list[Given]] = {}
-    for given in each_answer(store):
-        refuse_segments(given, form)
-        tally.note(given)
-        found.setdefault(given.query.id, []).append(given)
-    yield from found.values()
+    for group in each_query(store):
+        for given in group:
+            refuse_segments(given, form)
+            tally.note(given)
+        yield group
 
 
 # --- Argilla ------------------------------------------------------------------------------------------------------
@@ -118,12 +118,13 @@ def _tasks(group: Sequence[Given], tally: Tally) -> list[dict[str, Any]]:
             annotation = {"result": result, "was_cancelled": cancelled, "created_at": given.at}
             annotation["completed_by"] = {"email": given.answer.labeler} if given.answer.labeler else None
             pairs.setdefault(better_first, []).append(annotation)
-    return [_task(texts[i], texts[j], annotations) for (i, j), annotations in pairs.items()]
+    id = group[0].query.id
+    return [_task(id, texts[i], texts[j], annotations) for (i, j), annotations in pairs.items()]
 
 
-def _task(left: Response, right: Response, annotations: list[dict[str, Any]]) -> dict[str, Any]:
+def _task(query: str, left: Response, right: Response, annotations: list[dict[str, Any]]) -> dict[str, Any]:
     data = {"prompt": left.prompt, "left": left.text, "right": right.text}
-    return {"data": data, "annotations": annotations}
+    return {"data": data, "meta": {"query": query}, "annotations": annotations}
 
 
 def _results(answer: Answer, size: int) -> list[tuple[int, int, list[dict[str, Any]], bool]]:
