@@ -29,7 +29,7 @@ import numpy as np
 from rich.console import Console
 
 from prefrl.label.server.access import Access
-from prefrl.label.server.records import closed
+from prefrl.label.server.records import closed, store_id
 from prefrl.label.web import WebSettings
 from prefrl.store import Store
 from prefrl.types import Query, Response
@@ -58,7 +58,7 @@ def ask(store: Store[Response], count: int) -> None:
 
 
 def admit(folder: Path, count: int) -> list[str]:
-    """Invite `count` people, and log them in; returns the tokens of their sessions."""
+    """Invite `count` people, and log them in; returns the cookies of their sessions."""
     access, tokens, events = Access(), [], []
     for i in range(count):
         _, invited = access.invite(f"person {i}")
@@ -68,7 +68,9 @@ def admit(folder: Path, count: int) -> list[str]:
         events += [*invited, *session]
     with Store[Response](folder) as store:
         store.log.append(events)
-    return tokens
+        with store.log.reading() as connection:
+            name = f"prefrl-{store_id(connection)}"
+    return [f"{name}={token}" for token in tokens]
 
 
 # --- the server ----------------------------------------------------------------------------------------------------
@@ -163,10 +165,10 @@ def free_port() -> int:
 class Browser:
     """One person's connection: HTTP/1.1, kept alive, opened anew where it ended."""
 
-    def __init__(self, port: int, token: str) -> None:
+    def __init__(self, port: int, cookie: str) -> None:
         self.port = port
         self._head = (
-            f"Host: {HOST}:{port}\r\nOrigin: http://{HOST}:{port}\r\nCookie: prefrl={token}\r\n"
+            f"Host: {HOST}:{port}\r\nOrigin: http://{HOST}:{port}\r\nCookie: {cookie}\r\n"
             "Content-Type: application/json\r\n"
         )
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None

@@ -23,6 +23,8 @@ if TYPE_CHECKING:  # a run without people loads no web server
 
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
+LOOKED_AT = {"control": 250, "text": 1000}
+"""Open queries whose candidates check questions are made of: segments are large, and stay in memory."""
 
 
 class Strengths(Settings):
@@ -66,6 +68,8 @@ class WebSettings(Settings):
     """What these mean as preferences; without a strength the preferred one is taken to be better for certain."""
     guideline: str = ""
     """How to judge, shown beside the questions; an admin can change it on the page."""
+    consent: str = ""
+    """What people must agree to before their first question; who agreed to which version, and when, is kept."""
     question: str = ""
     """What is asked, in one sentence; "Which clip is better?" where it is left out."""
     check_share: float = Field(0.05, ge=0, le=0.5)
@@ -78,6 +82,8 @@ class WebSettings(Settings):
     """Whether people may have responses shown as markdown."""
     break_minutes: float = Field(30.0, ge=0)
     """After how long at work a break is suggested; 0 for never."""
+    stay_open: bool = False
+    """Whether a fixed pool is served on when all is answered, for a trainer elsewhere that asks more."""
     requests_per_second: float = Field(10.0, gt=0)
     """How many requests one person may make."""
     seed: int = Field(0, ge=0)
@@ -91,6 +97,13 @@ class WebSettings(Settings):
         from prefrl.label.server.access import check_name
 
         return check_name(name)
+
+    @field_validator("guideline", "consent", "question")
+    @classmethod
+    def _can_be_sent(cls, text: str) -> str:
+        if any("\ud800" <= c <= "\udfff" for c in text):
+            raise ValueError("the text holds half a surrogate pair: expected UTF-8")
+        return text
 
     @model_validator(mode="after")
     def _whole(self) -> WebSettings:
@@ -144,37 +157,41 @@ class WebLabeler:
         """Wait until people have answered enough of what was asked; all of it, where no more will be asked."""
         if self._site is None:
             return
-        self._file_checks(store, rng)
+        self._file_checks(self._site, store, rng)
         self._site.service.refresh()
-        told = -math.inf
-        while (left := self._site.left() if self.fixed else self._missing()) > 0:
-            if time.monotonic() - told > TELL_SECONDS:
+        self._wait(self._site)
+        while self.fixed and not self._site.say_goodbye():
+            self._wait(self._site)
+
+    def _wait(self, site: Site) -> None:
+        """Until nothing is missing; for ever, where a pool stays open."""
+        told, stay = -math.inf, self.fixed and self.settings.stay_open
+        while (left := site.left() if self.fixed else self._missing(site)) > 0 or stay:
+            if left > 0 and time.monotonic() - told > TELL_SECONDS:
                 told = time.monotonic()
-                self._tell(left)
-            self._site.wait(1.0)
-        if self.fixed:
-            self._site.say_goodbye()
+                self._tell(site, left)
+            site.wait(1.0)
 
-    def _missing(self) -> int:
+    def _missing(self, site: Site) -> int:
         """How many more questions must be judged before a round goes on; what everybody skipped is let go."""
-        assert self._site is not None
-        asked, judged, stuck = self._site.judged()
+        asked, judged, stuck = site.judged()
         share = self.settings.enough if self.settings.when_empty == "wait" else 0.0
-        wanted = min(asked, max(1, math.ceil(share * asked - 1e-9)))
-        return wanted - judged - stuck
+        wanted = max(1, math.ceil(share * (asked - stuck) - 1e-9))
+        return min(asked - stuck, wanted) - judged
 
-    def _tell(self, left: int) -> None:
-        assert self._site is not None
-        text = f"waiting for answers to {left} more question{'s' * (left != 1)} at {self._site.address}"
-        self.console.print(text, soft_wrap=True, markup=False)
+    def _tell(self, site: Site, left: int) -> None:
+        text = f"waiting for answers to {left} more question{'s' * (left != 1)} at {site.address}"
+        self.console.print(text + site.people_missing(), soft_wrap=True, markup=False)
 
-    def _file_checks(self, store: Store[C], rng: np.random.Generator) -> None:
-        """Choose check questions among the candidates of what was asked since, as many as will be given."""
-        asked = store.open_queries(self.name)
-        count = math.ceil(self.settings.check_share * len(asked))
-        if not count or store.counts()["asked"] == self._checked:
+    def _file_checks(self, site: Site, store: Store[C], rng: np.random.Generator) -> None:
+        """Choose check questions among the candidates of what is open, as many as will be given."""
+        asked = store.counts()["asked"]
+        if not self.settings.check_share or asked == self._checked:
             return
-        self._checked = store.counts()["asked"]
-        chosen = pick_checks(store, asked, count, rng)
+        self._checked, open_ids = asked, site.open_queries()
+        some = rng.permutation(len(open_ids))[: LOOKED_AT[self.task.kind]]
+        looked_at = [cast(Any, store).query(open_ids[i]) for i in sorted(some.tolist())]
+        count = math.ceil(self.settings.check_share * len(open_ids))
+        chosen = pick_checks(store, looked_at, count, rng)
         if chosen.queries:
             cast(Any, store).ask(chosen.queries, purpose="check", expected=chosen.expected)

@@ -184,6 +184,7 @@ def test_nothing_moves_by_itself_for_who_wants_less_motion(clip_house: House, vi
 
 def test_nothing_hidden_is_sent_to_the_page(clip_house: House, visit: Visit) -> None:
     ann = visit(clip_house.link("ann"))
+    ann.question()
     with ann.page.expect_response("**/api/assignments") as answer:
         ann.page.reload()
     sent = answer.value.json()["assignments"][0]

@@ -9,7 +9,7 @@ import pytest
 from browser.child import Child, free_port, serve_command
 from browser.house import House, clips, fill
 from browser.visitor import LOST, Visit, Visitor
-from playwright.sync_api import Browser, Route, expect
+from playwright.sync_api import APIResponse, Browser, Route, expect
 
 from prefrl.store import Store
 from prefrl.types import Segment
@@ -109,6 +109,55 @@ def test_unsent_answers_outlive_the_tab(text_house: House, visit: Visit) -> None
     again.saved()
     assert ann.held_back == 1
     assert text_house.spoken() == 3
+
+
+def test_a_question_whose_answer_overtakes_the_next_fetch_is_not_shown_again(text_house: House, visit: Visit) -> None:
+    ann = visit(text_house.link("ann"))
+    ann.allowed.append(LOST)
+    ann.question()
+    answers: list[Route] = []
+    fetches: list[tuple[Route, APIResponse]] = []
+    ann.context.route("**/api/answers", lambda route: answers.append(route))
+    answered = ann.press("1")
+    ann.question()
+    answers.clear()
+    ann.context.route("**/api/assignments", lambda route: fetches.append((route, route.fetch())), times=1)
+    ann.page.reload()
+    while not (answers and fetches):
+        ann.page.wait_for_timeout(50)
+    answers[0].continue_()
+    ann.saved()
+    route, response = fetches[0]
+    assert answered in response.text()
+    route.fulfill(response=response)
+    assert ann.question() != answered
+
+
+def test_the_back_button_leaves_one_answer_to_each_question(text_house: House, visit: Visit) -> None:
+    ann = visit(text_house.link("ann"))
+    ann.allowed.append(LOST)
+    given = [ann.press("1")]
+    ann.saved()
+    ann.go("/history")
+    expect(ann.test("entry")).to_have_count(1)
+    ann.page.go_back()
+    given.append(ann.press("2"))
+    ann.page.go_forward()
+    expect(ann.test("entries")).to_be_visible()
+    ann.page.go_back()
+    ann.question()
+    ann.context.route("**/api/answers", lambda route: route.abort())
+    given.append(ann.press("0"))
+    expect(ann.test("save-state")).to_have_attribute("data-state", "offline")
+    ann.page.goto("about:blank")
+    ann.context.unroute("**/api/answers")
+    ann.page.go_back()
+    ann.saved()
+    given.append(ann.press("1"))
+    ann.saved()
+    assert len(set(given)) == 4
+    assert text_house.spoken() == 4
+    assert set(map(text_house.query_of, given)) == set(text_house.answers())
 
 
 def test_who_was_signed_out_sends_what_is_unsent_with_the_next_link(text_house: House, visit: Visit) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
-from browser.house import House
+from browser.house import House, Open, fill, texts
 from browser.visitor import LOST, Visit
 from playwright.sync_api import expect
 
@@ -95,6 +97,40 @@ def test_a_new_guideline_is_put_before_people_at_work(text_house: House, visit: 
         ann.press("1")
     ann.saved()
     assert text_house.about()[-1]["guideline"] == text_house.service.guideline.version
+
+
+def test_what_must_be_agreed_to_comes_before_the_first_question_and_once(
+    tmp_path: Path, open_house: Open, visit: Visit
+) -> None:
+    house = open_house(
+        fill(tmp_path / "texts", texts(4)), consent="Your answers are **kept**.", guideline="Look twice."
+    )
+    ann = visit(house.link("ann"))
+    expect(ann.test("consent")).to_contain_text("Your answers are kept.")
+    ann.page.keyboard.press("1")
+    ann.page.goto(f"{house.origin}/history")
+    expect(ann.test("consent")).to_be_visible()
+    assert ann.test("guideline-dialog").count() == ann.test("question").count() == 0
+    ann.test("agree").click()
+    ann.test("guideline-read").click()
+    ann.go("/label")
+    ann.press("1")
+    ann.saved()
+    ann.page.reload()
+    ann.question()
+    assert ann.test("consent").count() == 0
+    assert house.service.consent.agreed == {"ann": house.service.consent.version}
+
+
+def test_a_text_that_must_be_agreed_to_comes_up_while_somebody_is_at_work(text_house: House, visit: Visit) -> None:
+    ann = visit(text_house.link("ann"))
+    ann.press("1")
+    text_house.service.consent.text, text_house.service.consent.version = "New terms.", "1"
+    expect(ann.test("consent")).to_contain_text("New terms.", timeout=10_000)
+    ann.test("agree").click()
+    ann.press("2")
+    ann.saved()
+    assert len(text_house.answers()) == 2
 
 
 def test_overlap_is_changed_while_people_label(text_house: House, visit: Visit) -> None:

@@ -26,6 +26,8 @@ class Visitor:
     """Beginnings or parts of console errors that the test brings about itself."""
     requests: list[str] = field(default_factory=list)
     troubles: list[str] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+    """Origins of other projects that this person works at."""
     held_back: int = 0
     """How often the page asked whether it may really be left."""
 
@@ -44,8 +46,9 @@ class Visitor:
         assert not wrong, f"the page complained: {wrong[:3]}"
 
     def window(self, link: str) -> Visitor:
-        """One more tab. What happens in it counts as this one's."""
+        """One more tab, at this project or another one. What happens in it counts as this one's."""
         other = replace(self, page=self.context.new_page())
+        self.others.append(origin_of(link))
         other.page.goto(link)
         return other
 
@@ -117,7 +120,13 @@ class Visitor:
 
     def _own(self, url: str) -> bool:
         parts = urlsplit(url)
-        return f"{parts.scheme}://{parts.netloc}" == self.origin
+        return f"{parts.scheme}://{parts.netloc}" in (self.origin, *self.others)
+
+
+def origin_of(link: str) -> str:
+    match = re.match(r"https?://[^/]+", link)
+    assert match, link
+    return match[0]
 
 
 Visit: TypeAlias = Callable[..., Visitor]
@@ -133,9 +142,7 @@ def enter(browser: Browser, link: str, wait: bool = True, **options: Any) -> Vis
     options = {"viewport": {"width": 1280, "height": 800}, "locale": "en-GB"} | options
     context = browser.new_context(**options)
     context.set_default_timeout(15_000)
-    match = re.match(r"https?://[^/]+", link)
-    assert match, link
-    visitor = Visitor(context, context.new_page(), match[0])
+    visitor = Visitor(context, context.new_page(), origin_of(link))
     visitor.watch()
     visitor.page.goto(link)
     if wait:

@@ -1,4 +1,4 @@
-"""What admins see and change, and what a trainer in another process reads."""
+"""What admins see and change."""
 
 from __future__ import annotations
 
@@ -7,22 +7,21 @@ import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
-from prefrl.label.server import api, records
+from prefrl.label.server import api
 from prefrl.label.server.access import Person
-from prefrl.label.server.people import admin, errors, service_of, trainer
+from prefrl.label.server.overview import Health, Link, Overview
+from prefrl.label.server.people import admin, errors, service_of
 from prefrl.label.server.security import Refused
 from prefrl.label.server.service import Service
 from prefrl.store import Store
 
 Admin = Annotated[Person, Depends(admin)]
 Served = Annotated[Service, Depends(service_of)]
-MOST = 10_000
-"""Labels in one answer to a trainer."""
 
 
 def admin_routes() -> APIRouter:
@@ -35,7 +34,7 @@ def admin_routes() -> APIRouter:
 
 def _add_overview(router: APIRouter) -> None:
     @router.get("/api/admin/overview", responses=errors(401))
-    async def overview(who: Admin, served: Served) -> api.Overview:
+    async def overview(who: Admin, served: Served) -> Overview:
         """Everything that the dashboard shows."""
         return await run_in_threadpool(_overview, served)
 
@@ -49,25 +48,10 @@ def _add_overview(router: APIRouter) -> None:
         done = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
         return FileResponse(path, filename=path.name, background=done)
 
-    @router.get("/api/labels", responses=errors(401))
-    async def labels(
-        who: Annotated[Person, Depends(trainer)],
-        served: Served,
-        after_seq: Annotated[int, Query(ge=0, le=2**53)] = 0,
-        limit: Annotated[int, Query(ge=1, le=MOST)] = 1000,
-    ) -> dict[str, list[dict[str, Any]]]:
-        """Answers and retractions after an event's number, oldest first."""
-
-        def read() -> list[dict[str, Any]]:
-            with served.store.log.reading() as connection:
-                return records.judgements_after(connection, after_seq, limit)
-
-        return {"labels": await run_in_threadpool(read)}
-
 
 def _add_people(router: APIRouter) -> None:
     @router.post("/api/admin/annotators", responses=errors(401, 409, 413, 415, 507))
-    async def add(sent: api.NewAnnotator, request: Request, who: Admin, served: Served) -> api.Link:
+    async def add(sent: api.NewAnnotator, request: Request, who: Admin, served: Served) -> Link:
         """Invite somebody new."""
         if served.access.person(sent.name) is not None:
             raise Refused(409, f"there is somebody called {sent.name} already: make a new link for them instead")
@@ -76,7 +60,7 @@ def _add_people(router: APIRouter) -> None:
     @router.post("/api/admin/annotators/{name}/{verb}", responses=errors(401, 404, 409, 507))
     async def change(
         name: str, verb: Literal["pause", "resume", "revoke", "invite"], request: Request, who: Admin, served: Served
-    ) -> api.Link | None:
+    ) -> Link | None:
         """Pause somebody, let them go on, send them away for good, or make a new link for them."""
         found = served.access.person(name)
         if found is None:
@@ -105,7 +89,7 @@ def _add_project(router: APIRouter) -> None:
         return await served.set_guideline(sent.text, who.name)
 
 
-async def _invite(served: Service, request: Request, name: str, role: Any) -> api.Link:
+async def _invite(served: Service, request: Request, name: str, role: Any) -> Link:
     """A link for somebody, under the address by which the admin came."""
     try:
         token, events = served.access.invite(name, role)
@@ -113,22 +97,22 @@ async def _invite(served: Service, request: Request, name: str, role: Any) -> ap
         raise Refused(422, str(error)) from None
     await served.record(events)
     origin = request.headers.get("origin") or f"{request.url.scheme}://{request.headers['host']}"
-    return api.Link(link=f"{origin}/#{token}")
+    return Link(link=f"{origin}/#{token}")
 
 
-def _overview(served: Service) -> api.Overview:
+def _overview(served: Service) -> Overview:
     overlap, counts = served.desk.policy.overlap, served.desk.counts()
     with served.store.log.reading() as connection:
         figures = served.dashboard.figures(connection, overlap)
     clips = served.clips.counts() if served.clips is not None else {}
-    health = api.Health(
+    health = Health(
         store=served.trouble,
         sequence=served.seq,
         queue=served.writer.waiting,
         clips=clips,
         uptime_seconds=served.clock() - served.begun,
     )
-    return api.Overview(
+    return Overview(
         page=served.terms.page,
         leased=counts.leased,
         overlap=overlap,

@@ -104,6 +104,10 @@ class Flag(Body):
     text: str = Field(min_length=1, max_length=COMMENT)
 
 
+class Agreement(Body):
+    version: str = Field(max_length=40)
+
+
 class NewAnnotator(Body):
     name: str = Field(min_length=1, max_length=80)
     role: Literal["annotator", "admin", "trainer"] = "annotator"
@@ -150,12 +154,16 @@ class Progress(Plain):
 
 
 class Me(Plain):
+    store: str
+    """Which store this is, of all that a browser may know."""
     name: str
     role: Literal["annotator", "admin", "trainer"]
     page: Page
     progress: Progress
     guideline: str
     """Version of the guideline; "" where there is none."""
+    consent: str
+    """Version of what this person must agree to first; "" where there is nothing, or no more."""
 
 
 class State(Plain):
@@ -167,6 +175,8 @@ class State(Plain):
     """The disk is full: answers stay in the browser until there is room."""
     finished: bool
     """The run needs no more answers."""
+    consent: str
+    """As in `Me`."""
 
 
 class Item(Plain):
@@ -193,8 +203,9 @@ class Assignment(Plain):
 
 class Assignments(Plain):
     assignments: list[Assignment]
-    reason: Literal["waiting", "done", "paused", "read-only"] | None = None
-    """Why there are none: more may come, none will, this person is paused, or nothing can be stored."""
+    reason: Literal["waiting", "done", "paused", "read-only", "consent"] | None = None
+    """Why there are none: more may come, none will, this person is paused, nothing can be stored, or this person must
+    agree to something first."""
 
 
 class Receipt(Plain):
@@ -226,8 +237,9 @@ class Guideline(Plain):
     text: str
 
 
-class Link(Plain):
-    link: str
+class Consent(Plain):
+    version: str
+    text: str
 
 
 class Failure(Plain):
@@ -235,7 +247,7 @@ class Failure(Plain):
     """One sentence for people."""
 
 
-# --- for admins ----------------------------------------------------------------------------------------------------
+# --- for admins; see `overview` too ---------------------------------------------------------------------------------
 
 
 class Interval(Plain):
@@ -283,36 +295,3 @@ class AgreementRow(Plain):
     krippendorff: Interval
     intransitive: Interval
     """Share of fully compared triads that go round in a circle."""
-
-
-class Health(Plain):
-    store: str
-    """ "ok", "read-only" or what is wrong."""
-    sequence: int
-    queue: int
-    """Submissions waiting to be written."""
-    clips: dict[str, int]
-    """drawn, failed, cached, waiting."""
-    uptime_seconds: float
-
-
-class Overview(Plain):
-    page: Page
-    asked: int
-    answered: int
-    open: int
-    leased: int
-    skipped: int
-    incomparable: int
-    overlap: int
-    guideline: Guideline
-    throughput: list[tuple[str, int]]
-    """(start of the minute or hour, UTC ISO; answers in it), oldest first."""
-    throughput_unit: Literal["minute", "hour"]
-    annotators: list[AnnotatorRow]
-    agreement: AgreementRow
-    health: Health
-    flags: list[dict[str, str]]
-    """Reported problems: at, actor, query, text; newest first, 50 at most."""
-    exports: list[str]
-    """Names that /api/admin/export/{name} knows."""

@@ -15,9 +15,10 @@ from prefrl.label.server import api, pages
 from prefrl.label.server.access import Person
 from prefrl.label.server.admin import admin_routes
 from prefrl.label.server.clips import ClipBusy, ClipFailed, ClipUnknown
-from prefrl.label.server.people import COOKIE, errors, person, service_of, viewer
+from prefrl.label.server.people import cookie_name, errors, person, service_of, viewer
 from prefrl.label.server.security import Guard, Refused, Rules
 from prefrl.label.server.service import Service
+from prefrl.label.server.trainer import trainer_routes
 from prefrl.label.server.writer import Unavailable
 from prefrl.log import StoreError, StoreFull
 
@@ -46,6 +47,7 @@ def routes(service: Service) -> FastAPI:
     _add_work(app)
     _add_record(app)
     app.include_router(admin_routes())
+    app.include_router(trainer_routes())
     return app
 
 
@@ -99,15 +101,16 @@ def _add_session(app: FastAPI) -> None:
         token, events = served.access.session(found.name)
         await served.record(events)
         secure = request.url.scheme == "https"
-        response.set_cookie(COOKIE, token, max_age=MONTH, httponly=True, samesite="strict", secure=secure)
+        name = cookie_name(served)
+        response.set_cookie(name, token, max_age=MONTH, httponly=True, samesite="strict", secure=secure)
         return await _me(served, found)
 
     @app.delete("/api/session", status_code=204, responses=errors(401, 403, 503, 507))
     async def logout(request: Request, who: Someone, served: Served) -> Response:
         """End the session."""
-        await served.record(served.access.leave(request.cookies[COOKIE]))
+        await served.record(served.access.leave(request.cookies[cookie_name(served)]))
         response = Response(status_code=204)
-        response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+        response.delete_cookie(cookie_name(served), httponly=True, samesite="strict")
         return response
 
     @app.get("/api/me", responses=errors(401, 403, 429))
@@ -127,6 +130,7 @@ def _add_session(app: FastAPI) -> None:
             paused=who.state == "paused",
             read_only=served.read_only,
             finished=served.finished,
+            consent=served.consent.owed(who.name),
         )
         body = found.model_dump_json().encode()
         headers = {"etag": f'"{hashlib.sha256(body).hexdigest()[:16]}"'}
@@ -143,6 +147,8 @@ def _add_work(app: FastAPI) -> None:
             return api.Assignments(assignments=[], reason="paused")
         if served.finished:
             return api.Assignments(assignments=[], reason="done")
+        if served.consent.owed(who.name):
+            return api.Assignments(assignments=[], reason="consent")
         try:
             found = await served.assign(who.name, sent.want)
         except StoreFull:
@@ -182,11 +188,28 @@ def _add_record(app: FastAPI) -> None:
         """How to judge."""
         return served.guideline
 
+    @app.get("/api/consent", responses=errors(401, 403, 429))
+    async def consent(who: Someone, served: Served) -> api.Consent:
+        """What I am to agree to before my first question."""
+        return api.Consent(version=served.consent.version, text=served.consent.text)
+
+    @app.post("/api/consent", status_code=204, responses=errors(401, 403, 409, 413, 415, 429, 503, 507))
+    async def agree(sent: api.Agreement, who: Someone, served: Served) -> None:
+        """I agree."""
+        await served.agree(who.name, sent.version)
+
 
 async def _me(served: Service, who: Person) -> api.Me:
     progress = await served.progress(who.name)
-    page, version = served.terms.page, served.guideline.version
-    return api.Me(name=who.name, role=who.role, page=page, progress=progress, guideline=version)
+    return api.Me(
+        store=served.store_id,
+        name=who.name,
+        role=who.role,
+        page=served.terms.page,
+        progress=progress,
+        guideline=served.guideline.version,
+        consent=served.consent.owed(who.name),
+    )
 
 
 def _explain_errors(app: FastAPI) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -14,6 +15,11 @@ from prefrl.log import EventLog
 
 REMEMBERED = 1000
 """Queries whose candidates are kept in memory."""
+
+
+def whole(text: str) -> str:
+    """A text without halves of surrogate pairs, which cannot be sent: a model may break off within a character."""
+    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
 class ClipSource(Protocol):
@@ -58,7 +64,7 @@ class Cards:
             assignment_id=given.id,
             query_id=given.query,
             kind=self._kind,
-            prompt=shown[0].get("prompt"),
+            prompt=whole(shown[0]["prompt"]) if "prompt" in shown[0] else None,
             items=[self._item(slot, candidate) for slot, candidate in enumerate(shown)],
             guideline=given.guideline,
             lease_seconds=self._lease,
@@ -66,7 +72,7 @@ class Cards:
 
     def _item(self, slot: int, candidate: dict[str, Any]) -> api.Item:
         if candidate["type"] == "response":
-            return api.Item(slot=slot, text=candidate["text"])
+            return api.Item(slot=slot, text=whole(candidate["text"]))
         media = self._clips.names(candidate["id"]) if self._clips is not None else []
         return api.Item(slot=slot, media=media, steps=candidate["steps"], fps=self._fps)
 

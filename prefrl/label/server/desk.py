@@ -171,7 +171,7 @@ class Desk:
 
     # --- what comes back -------------------------------------------------------------------------------------
 
-    def answered(self, given: Given, answers: int) -> None:
+    def answered(self, given: Given, answers: int, skipped: bool = False) -> None:
         """An assignment was answered; `answers` are those to its query that stand now, skips not among them."""
         with self._lock:
             person = self._person(given.annotator)
@@ -184,6 +184,7 @@ class Desk:
             question = self._pool.get(given.query)
             if given.purpose != "label" or question is None:
                 return
+            self._pool.note_skip(question, given.annotator, skipped)
             self._pool.count(question, answers)
             self._pool.release(question, given.annotator)
             if answers >= self.policy.overlap:
@@ -206,6 +207,7 @@ class Desk:
                 self._closed -= 1
                 self._pool.restore(question)
             else:
+                self._pool.note_skip(known, given.annotator, skipped=False)
                 self._pool.count(known, question.answered)
             self._revive(given)
 
@@ -239,8 +241,9 @@ class Desk:
             return mine, self._closed, asked, self._pool.left(annotator) + held
 
     def stuck(self, people: Iterable[str]) -> int:
-        """How many open questions nobody holds, and none of these people can be given: all of them skipped."""
+        """How many open questions all of these people have skipped; see `Pool.stuck`."""
         with self._lock:
+            self._pool.sweep()
             return self._pool.stuck(people)
 
     def _person(self, annotator: str) -> Person:

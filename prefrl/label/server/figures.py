@@ -28,7 +28,7 @@ GROWTH = 1.01
 
 @dataclass(frozen=True)
 class Figures:
-    """What `api.Overview` says of questions, answers and people."""
+    """What `overview.Overview` says of questions, answers and people."""
 
     asked: int
     """Questions, checks not among them."""

@@ -7,7 +7,8 @@ happened at the same time, or before a crash, can lead it astray; the desk is to
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from collections import OrderedDict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import sqlalchemy as sql
@@ -22,6 +23,8 @@ from prefrl.store import Store
 from prefrl.tables import assignment, canonical, submission
 from prefrl.types import Answer, Comparison, Ranking, Skip
 
+REMEMBERED = 10_000
+"""Submissions that changed nothing."""
 _KNOWN = sql.select(submission).where(submission.c.id == sql.bindparam("b_id"))
 
 
@@ -35,6 +38,7 @@ class Taken:
     """What it answers; None for a duplicate."""
     answers: int = 0
     """How many answers to the query stand with it."""
+    skipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Intake:
     desk: Desk
     strengths: dict[str, float]
     """slight, clear and much as preferences."""
+    _idle: OrderedDict[str, str] = field(default_factory=OrderedDict)
+    """The newest submissions that changed nothing, of which the log says nothing, and their digests."""
 
     def assign(self, tx: Transaction, name: str, want: int, guideline: str, picked: list[Given]) -> list[Given]:
         """What a person is to answer next. The new ones are noted in `picked` at once, should this fail later."""
@@ -76,10 +82,11 @@ class Intake:
         for something else.
         """
         digest = _digest(name, sent)
-        if (seq := _known(tx.connection, sent.submission_id, digest)) is not None:
+        if (seq := self._known(tx.connection, sent.submission_id, digest)) is not None:
             return Taken(seq, duplicate=True)
         given, answered = self._own(tx.connection, name, sent.assignment_id)
         if answered is not None and not self.desk.undone(given):
+            self._note_idle(sent.submission_id, digest)
             return Taken(answered, duplicate=True)
         answer = in_item_space(sent, given, self.strengths)
         about = self._about(sent, given, digest)
@@ -87,17 +94,19 @@ class Intake:
             seq = self._file_repeat(tx, given, answer, about, again=answered is not None)
         else:
             seq = self.store.put(tx, answer, about)
-        return Taken(seq, False, given, records.answers_to(tx.connection, given.query))
+        answers = records.answers_to(tx.connection, given.query)
+        return Taken(seq, False, given, answers, skipped=sent.outcome == "skip")
 
     def undo(self, tx: Transaction, name: str, sent: api.Undo) -> Reopened:
         """Take one of a person's last answers back. Doing it again changes nothing."""
         digest = _digest(name, sent)
-        known = _known(tx.connection, sent.submission_id, digest)
+        known = self._known(tx.connection, sent.submission_id, digest)
         given, answered = self._own(tx.connection, name, sent.assignment_id)
         answer = records.last_answer(tx.connection, given)
         if not answer:
             raise Refused(409, "this question was not answered yet: there is nothing to take back")
         if known is not None or answered is None or self.desk.undone(given):
+            self._note_idle(sent.submission_id, digest)
             return Reopened(given, answer)
         if answered < _oldest(tx.connection, name):
             raise Refused(409, f"only one of the last {api.HISTORY} answers can be taken back")
@@ -109,11 +118,24 @@ class Intake:
     def flag(self, tx: Transaction, name: str, sent: api.Flag) -> Taken:
         """File a problem that somebody reports."""
         digest = _digest(name, sent)
-        if (seq := _known(tx.connection, sent.submission_id, digest)) is not None:
+        if (seq := self._known(tx.connection, sent.submission_id, digest)) is not None:
             return Taken(seq, duplicate=True)
         query = self._own(tx.connection, name, sent.assignment_id)[0].query if sent.assignment_id else ""
         body = {"text": sent.text, "about": {"submission": sent.submission_id, "digest": digest}}
         return Taken(tx.append(row(f"flag:{sent.submission_id}", "flag", query, name, body)), duplicate=False)
+
+    def _known(self, connection: Connection, id: str, digest: str) -> int | None:
+        """The number of a submission that came before. Raises `Refused` where its id was used for something else."""
+        found = connection.execute(_KNOWN, {"b_id": id}).first()
+        before = self._idle.get(id, digest) if found is None else found.digest
+        if before != digest:
+            raise Refused(409, "this submission id was used for something else")
+        return None if found is None else int(found.seq)
+
+    def _note_idle(self, id: str, digest: str) -> None:
+        self._idle[id] = digest
+        if len(self._idle) > REMEMBERED:
+            self._idle.popitem(last=False)
 
     def _own(self, connection: Connection, name: str, id: str) -> tuple[Given, int | None]:
         found = records.given(connection, id)
@@ -165,14 +187,6 @@ def _digest(name: str, sent: api.Body) -> str:
     """Of who sent what: the same id from somebody else is not the same submission."""
     told = canonical([name, type(sent).__name__, sent.model_dump()])
     return hashlib.sha256(told.encode()).hexdigest()
-
-
-def _known(connection: Connection, id: str, digest: str) -> int | None:
-    """The number of a submission that came before. Raises `Refused` where its id was used for something else."""
-    found = connection.execute(_KNOWN, {"b_id": id}).first()
-    if found is not None and found.digest != digest:
-        raise Refused(409, "this submission id was used for something else")
-    return None if found is None else int(found.seq)
 
 
 def _oldest(connection: Connection, name: str) -> int:

@@ -12,10 +12,9 @@ from prefrl.label.server.access import Person
 from prefrl.label.server.security import Refused
 from prefrl.label.server.service import Service
 
-COOKIE = "prefrl"
 ALWAYS = (400, 403, 408, 429, 500, 503)
 """What any request may be answered with: the guard says it, or the disk."""
-_cookie = APIKeyCookie(name=COOKIE, auto_error=False)
+_cookie = APIKeyCookie(name="prefrl-STORE", description="STORE is `store` of /api/me.", auto_error=False)
 _bearer = HTTPBearer(auto_error=False)
 
 
@@ -29,10 +28,16 @@ async def service_of(request: Request) -> Service:
     return found
 
 
+def cookie_name(served: Service) -> str:
+    """Of the session's cookie. A browser sends a host's cookies to all its ports: each store has one of its own."""
+    return f"prefrl-{served.store_id}"
+
+
 async def viewer(
-    served: Annotated[Service, Depends(service_of)], token: Annotated[str | None, Depends(_cookie)]
+    request: Request, served: Annotated[Service, Depends(service_of)], _: Annotated[None, Depends(_cookie)]
 ) -> Person:
     """The person whose session the cookie holds. Raises `Refused`."""
+    token = request.cookies.get(cookie_name(served))
     found = served.access.who(token, "session") if token else None
     if found is None:
         raise Refused(401, "you are not logged in: open the link that you were given")

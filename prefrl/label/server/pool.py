@@ -116,6 +116,10 @@ class Pool:
         question.answered = answers
         self._update(question)
 
+    def note_skip(self, question: Question, annotator: str, skipped: bool) -> None:
+        """Whether somebody's word on a question is a skip now."""
+        question.skipped = question.skipped | {annotator} if skipped else question.skipped - {annotator}
+
     def sweep(self) -> None:
         """End the leases whose time is up."""
         now = self._clock()
@@ -133,9 +137,13 @@ class Pool:
         return sum(bool(question.leases) for question in self._questions.values())
 
     def stuck(self, people: Iterable[str]) -> int:
-        """How many questions nobody holds, and none of these people can be given: all of them skipped."""
-        names = set(people)
-        return sum(q.free and not q.leases and names <= q.seen for q in self._questions.values())
+        """How many questions all of these people have skipped, and nobody has judged or holds; none without people.
+
+        A question that was given out and left, or that needs answers of more people than there are, only waits.
+        """
+        names = frozenset(people)
+        untouched = (q for q in self._questions.values() if not (q.answered or q.leases))
+        return sum(names <= q.skipped for q in untouched) if names else 0
 
     # --- keeping count ---------------------------------------------------------------------------------------
 

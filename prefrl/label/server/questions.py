@@ -42,6 +42,8 @@ class Question:
     """Who holds it, and until when."""
     free: bool = False
     """Whether somebody more can be given it; kept up by the desk."""
+    skipped: frozenset[str] = frozenset()
+    """Whose last word on it is a skip."""
 
     @cached_property
     def seen(self) -> set[str]:

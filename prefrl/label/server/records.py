@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 from prefrl.label.server.api import HISTORY
 from prefrl.label.server.desk import REMEMBERED
 from prefrl.label.server.questions import BETWEEN, Given, Past, Question
-from prefrl.projection import ANSWERS, CHUNK, RETRACTED, chunks
+from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, RETRACTED, chunks
 from prefrl.tables import assignment, event, query, setting, standing
 
 done = query.c.judged + query.c.incomparable
@@ -44,27 +44,33 @@ def _questions(connection: Connection, wanted: sql.ColumnElement[bool]) -> list[
     waits = assignment.c.answered.is_(None)  # who has answered has said a word
     for id, name in connection.execute(given.where(wanted, waits, assignment.c.purpose != "repeat")).all():
         seen[id].add(name)
-    silent = _silent(connection)
+    silent, skipped = _silent(connection)
     # Of a million words, one text of names for each query, all from the index, takes a fifth of the time of the rows.
     all_names = sql.func.aggregate_strings(standing.c.labeler, BETWEEN)
     names = sql.select(all_names).where(standing.c.query == query.c.id).scalar_subquery()
     columns = *(query.c[name] for name in ("id", "seq", "batch", "size", "purpose")), done, sql.func.coalesce(names, "")
     found = [Question(*row) for row in connection.execute(sql.select(*columns).where(wanted).order_by(query.c.seq))]
     for one in found:
+        if one.id in skipped:
+            one.skipped = frozenset(skipped[one.id])
         if one.id in silent or one.id in seen:
             one.names = BETWEEN.join(({*one.names.split(BETWEEN)} - silent[one.id]) | seen[one.id])
     return found
 
 
-def _silent(connection: Connection) -> dict[str, set[str]]:
-    """Of each query those whose word there says nothing: it was taken back, or nobody could be asked."""
-    found: dict[str, set[str]] = defaultdict(set)
+def _silent(connection: Connection) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
+    """Of each query those whose word there says nothing (it was taken back, or nobody could be asked), and who skipped.
+
+    Both are rare: they are found by the log's index of kinds.
+    """
+    silent, skipped = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
     said = (standing.c.query == event.c.subject) & (standing.c.labeler == event.c.actor)
-    some = sql.select(standing.c.query, standing.c.labeler).join(event, said & (standing.c.seq == event.c.seq))
-    rare = event.c.kind.in_(("skip", "retract")), standing.c.kind.not_in((*ANSWERS, "incomparable"))
-    for id, name in connection.execute(some.where(*rare)).all():
-        found[id].add(name)
-    return found
+    columns = standing.c.query, standing.c.labeler, standing.c.kind
+    some = sql.select(*columns).join(event, said & (standing.c.seq == event.c.seq))
+    rare = event.c.kind.in_(("skip", "retract")), standing.c.kind.not_in((*JUDGEMENTS, "incomparable"))
+    for id, name, kind in connection.execute(some.where(*rare)).all():
+        (skipped if kind == "skip" else silent)[id].add(name)
+    return silent, skipped
 
 
 def closed(connection: Connection, overlap: int) -> int:
@@ -152,9 +158,28 @@ def settings(connection: Connection) -> dict[str, Any]:
     return {row.key: json.loads(row.value) for row in connection.execute(sql.select(setting))}
 
 
+def store_id(connection: Connection) -> str:
+    """The beginning of the first event's hash, which no other store has but a copy; "" where there is none."""
+    return str(connection.scalar(sql.select(event.c.hash).order_by(event.c.seq).limit(1)) or "")[:12]
+
+
 def newest(connection: Connection) -> int:
     """The number of the newest event."""
     return int(connection.scalar(sql.select(sql.func.max(event.c.seq))) or 0)
+
+
+def open_queries(connection: Connection) -> list[str]:
+    """The ids of queries without any answer but a skip, oldest first."""
+    return list(
+        connection.scalars(sql.select(query.c.id).where(query.c.purpose == "label", done == 0).order_by(query.c.seq))
+    )
+
+
+def queries_after(connection: Connection, seq: int, limit: int) -> list[tuple[int, str]]:
+    """Number and id of the queries that were asked after an event, oldest first; checks not among them."""
+    asked = (query.c.seq > seq) & (query.c.purpose == "label")
+    some = sql.select(query.c.seq, query.c.id).where(asked).order_by(query.c.seq).limit(limit)
+    return [(row.seq, row.id) for row in connection.execute(some)]
 
 
 def judgements_after(connection: Connection, seq: int, limit: int) -> list[dict[str, Any]]:

@@ -22,6 +22,8 @@ from prefrl.label.server.strict import NotStrict, check_json
 
 BODY = 64 * 1024
 """Bytes of a request's body."""
+LARGER = {("PUT", "/api/queries"): 256 * 1024}
+"""Of requests that hold many texts."""
 HEAD = 16 * 1024
 """Bytes of a request's headers together."""
 SAFE = ("GET", "HEAD")
@@ -62,7 +64,7 @@ class Rules:
     body_seconds: float = 15.0
     """In which a body must have come."""
     seconds: float = 60.0
-    """In which a request must be answered."""
+    """In which a request must be answered, and then each part of the response be read."""
 
 
 class Guard:
@@ -82,8 +84,8 @@ class Guard:
         try:
             check_head(scope, self.rules)
             body = await self._body(scope, receive)
-            async with asyncio.timeout(self.rules.seconds):
-                await self.app(scope, _replay(body, receive), answer.send)
+            async with asyncio.timeout(self.rules.seconds) as timer:
+                await self.app(scope, _replay(body, receive), self._in_time(timer, answer.send))
         except Refused as error:
             await answer.refuse(error)
         except TimeoutError:
@@ -91,6 +93,15 @@ class Guard:
         except Exception as error:
             log.error("%s", _where(error, scope))
             await answer.refuse(Refused(500, "something went wrong on the server; what was acknowledged is safe"))
+
+    def _in_time(self, timer: asyncio.Timeout, send: Send) -> Send:
+        """Give the client as long again for each part of a response: a long download is not a slow answer."""
+
+        async def send_part(message: Message) -> None:
+            timer.reschedule(asyncio.get_running_loop().time() + self.rules.seconds)
+            await send(message)
+
+        return send_part
 
     async def _body(self, scope: Scope, receive: Receive) -> bytes | None:
         """The whole body of a request that may change something, or None for one that may not."""
@@ -102,11 +113,12 @@ class Guard:
             raise Refused(400, "a body has a Content-Length or a Transfer-Encoding, not both")
         if not length.isdigit() or len(length) > 12:
             raise Refused(400, "the header Content-Length is no number")
-        if int(length) > BODY:
-            raise Refused(413, f"a request may have {BODY} bytes, got {int(length)}")
+        most = LARGER.get((scope["method"], scope["path"]), BODY)
+        if int(length) > most:
+            raise Refused(413, f"a request may have {most} bytes, got {int(length)}")
         try:
             async with asyncio.timeout(self.rules.body_seconds):
-                body = await _read(receive)
+                body = await _read(receive, most)
         except TimeoutError:
             raise Refused(408, "the request did not come to its end in time") from None
         if body:
@@ -218,7 +230,7 @@ def _headers(scope: Scope) -> dict[bytes, bytes]:
     return found
 
 
-async def _read(receive: Receive) -> bytes:
+async def _read(receive: Receive, most: int) -> bytes:
     """A body, counted as it comes: what a header says of its length proves nothing."""
     body = bytearray()
     while True:
@@ -226,8 +238,8 @@ async def _read(receive: Receive) -> bytes:
         if message["type"] == "http.disconnect":
             raise Refused(400, "the connection was closed before the request came to its end")
         body += message.get("body", b"")
-        if len(body) > BODY:
-            raise Refused(413, f"a request may have {BODY} bytes")
+        if len(body) > most:
+            raise Refused(413, f"a request may have {most} bytes")
         if not message.get("more_body", False):
             return bytes(body)
 

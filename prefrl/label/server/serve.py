@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import socket
 import threading
 import time
@@ -105,7 +106,13 @@ class WebServer:
     def start(self, host: str, port: int) -> int:
         """Listen, and return the port. Raises `ConfigError` where that is not possible."""
         listener = listen(host, port)
-        self._server.config.load()  # what is wrong with a certificate is said here
+        try:
+            self._server.config.load()
+        except OSError as error:  # of which ssl.SSLError is one
+            listener.close()
+            raise ConfigError(
+                f"labeler.tls_cert and labeler.tls_key hold no certificate and its key in PEM ({error.strerror})"
+            ) from None
         self._thread = threading.Thread(target=self._run, args=(listener,), name="prefrl-server", daemon=True)
         self._thread.start()
         return int(listener.getsockname()[1])
@@ -124,11 +131,32 @@ def listen(host: str, port: int) -> socket.socket:
     """A socket on an address. Raises `ConfigError` where it is taken, or is not this machine's."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError as error:
+        raise ConfigError(
+            f"labeler.host={host}: there is no such host ({error.strerror}); expected an address of this machine, or "
+            "0.0.0.0 for all of them"
+        ) from None
+    try:
         return socket.create_server(cast(Any, address[:2]), family=family, backlog=BACKLOG)
     except OSError as error:
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise ConfigError(
+                f"labeler.host={host}: that is no address of this machine; expected one, or 0.0.0.0 for all of them"
+            ) from None
         raise ConfigError(
             f"labeler.port={port}: cannot listen on {host} ({error.strerror}); choose another port, or 0 for any"
         ) from None
+
+
+def check_tls(cert: Path | None, key: Path | None) -> tuple[Path, Path] | None:
+    """The files of a certificate and its key, if there are any. Raises `ConfigError` where one cannot be read."""
+    for name, path in (("tls_cert", cert), ("tls_key", key)):
+        try:
+            if path is not None:
+                path.open("rb").close()
+        except OSError as error:
+            raise ConfigError(f"labeler.{name}={path}: cannot be read ({error.strerror})") from None
+    return (cert, key) if cert and key else None
 
 
 def _idle(connection: H11Protocol) -> bool:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from threading import Condition
+from threading import Condition, Lock
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from sqlalchemy.exc import OperationalError
 from starlette.concurrency import run_in_threadpool
 
 from prefrl.label.server import api, records
@@ -20,10 +20,20 @@ from prefrl.label.server.cards import Cards, ClipSource
 from prefrl.label.server.desk import Desk
 from prefrl.label.server.intake import Intake, Reopened, Taken
 from prefrl.label.server.questions import Given, Policy
-from prefrl.label.server.security import Buckets
-from prefrl.label.server.writer import Writer
+from prefrl.label.server.security import Buckets, Refused
+from prefrl.label.server.texts import (
+    TEXT,
+    Consent,
+    agreement_event,
+    agreements,
+    guideline_event,
+    text_event,
+    version_of,
+)
+from prefrl.label.server.writer import Unavailable, Writer
 from prefrl.log import Transaction, row
 from prefrl.store import Store
+from prefrl.types import Query
 
 if TYPE_CHECKING:
     from prefrl.label.server.figures import Dashboard
@@ -41,6 +51,8 @@ class Terms:
     """slight, clear and much as preferences."""
     guideline: str = ""
     """Its text at the beginning."""
+    consent: str = ""
+    """What people agree to before their first question; "" for nothing."""
     fps: float = 0.0
     fixed: bool = False
     """No more questions will come: who has answered all is done."""
@@ -59,8 +71,11 @@ class Service:
     finished: bool = False
     """Whether the run needs no more answers."""
     guideline: api.Guideline = field(default_factory=lambda: api.Guideline(version="", text=""))
+    consent: Consent = field(default_factory=Consent)
     changed: Condition = field(default_factory=Condition)
     """Notified after each answer that is on disk."""
+    notes: list[str] = field(default_factory=list)
+    """Settings that do not hold, since others were made on the page."""
 
     def __post_init__(self) -> None:
         self.access = Access()
@@ -73,6 +88,8 @@ class Service:
         self.logins = Buckets(1.0, 20.0, self.clock)
         self.begun = self.clock()
         self._asked = self.seq = 0
+        self._loading = Lock()
+        self._store_id = ""
 
     # --- opening and closing ---------------------------------------------------------------------------------
 
@@ -83,11 +100,7 @@ class Service:
             kept = records.settings(connection)
         self.load(int(kept.get("overlap", self.terms.policy.overlap)))
         self.writer.start()
-        text = kept.get("guideline", "")
-        if not kept.get("guideline") and self.terms.guideline:
-            text = self.terms.guideline
-            self.append([guideline_event(text, "")])
-        self.guideline = api.Guideline(version=version_of(text), text=text)
+        self._take_up(kept)
 
     def close(self) -> None:
         """Write what waits, and end."""
@@ -95,7 +108,7 @@ class Service:
 
     def load(self, overlap: int) -> None:
         """Have the desk begin anew from the store."""
-        with self.store.log.reading() as connection:
+        with self._loading, self.store.log.reading() as connection:
             self._asked = self.seq = records.newest(connection)
             questions = records.questions(connection, overlap)
             closed = records.closed(connection, overlap)
@@ -103,11 +116,12 @@ class Service:
             self.desk.load(questions, records.unanswered(connection), closed, overlap, back)
 
     def refresh(self) -> None:
-        """Have the desk know what was asked since."""
-        with self.store.log.reading() as connection:
+        """Have the desk know what was asked since. A run does so while an admin may have all loaded anew."""
+        with self._loading, self.store.log.reading() as connection:
             newest = records.newest(connection)
             self.desk.add(records.questions(connection, self.desk.policy.overlap, after=self._asked))
-        self._asked = self.seq = max(newest, self._asked)
+            self._asked = max(newest, self._asked)
+        self.seq = max(newest, self.seq)
 
     def append(self, events: list[Event]) -> None:
         """Append events from outside the application, and wait for the disk."""
@@ -177,6 +191,33 @@ class Service:
         await self.write(lambda tx: tx.append(event), note)
         return made
 
+    async def agree(self, name: str, version: str) -> None:
+        """Somebody agrees to what people are asked for. Raises `Refused` where they have read another version."""
+        if version != self.consent.version or not version:
+            raise Refused(409, "this text is not the one that counts any more: read the new one")
+        event = agreement_event(name, version)
+
+        def note(_: object) -> None:
+            self.consent.agreed[name] = version
+
+        await self.write(lambda tx: tx.append(event), note)
+
+    async def ask(self, queries: Sequence[Query[Any]]) -> None:
+        """Ask what a trainer elsewhere wants to know; what was asked before is left alone."""
+        try:
+            await run_in_threadpool(self.store.ask, queries)
+        except OperationalError:  # somebody else has locked the database
+            raise Unavailable("this could not be stored: try again in a moment") from None
+        await run_in_threadpool(self.refresh)
+
+    @property
+    def store_id(self) -> str:
+        """What tells this store from all others, in browsers that know several; "" before its first event."""
+        if not self._store_id:
+            with self.store.log.reading() as connection:
+                self._store_id = records.store_id(connection)
+        return self._store_id
+
     @cached_property
     def dashboard(self) -> Dashboard:
         """The figures for admins, made when the first one looks: a server is up in half the time without scipy."""
@@ -194,6 +235,21 @@ class Service:
         if self.read_only:
             return "read-only"
         return self.writer.trouble or ("ok" if self.writer.alive else "nothing can be stored: the writer has ended")
+
+    def _take_up(self, kept: Mapping[str, Any]) -> None:
+        """The texts and settings that hold: those that were made on the page before those that this was started with.
+
+        What is agreed to can be changed by the settings alone.
+        """
+        terms, text = self.terms, kept.get("guideline", "")
+        if not text and terms.guideline:
+            text = terms.guideline
+            self.append([guideline_event(text, "")])
+        self.guideline = api.Guideline(version=version_of(text), text=text)
+        if terms.consent != kept.get(TEXT, ""):
+            self.append([text_event(terms.consent)])
+        self.consent = Consent(terms.consent, version_of(terms.consent), agreements(kept))
+        self.notes = list(ignored(terms, self.desk.policy.overlap, self.guideline))
 
     def _meet(self, name: str) -> None:
         with self.store.log.reading() as connection:
@@ -215,7 +271,7 @@ class Service:
     def _taken(self, taken: Taken) -> None:
         self.seq = max(self.seq, taken.seq)
         if taken.given is not None:
-            self.desk.answered(taken.given, taken.answers)
+            self.desk.answered(taken.given, taken.answers, taken.skipped)
         with self.changed:
             self.changed.notify_all()
 
@@ -229,10 +285,15 @@ class Service:
         self.access.note([one for one in events if one["kind"] in ("annotator", "state", "token", "revoke")])
 
 
-def version_of(text: str) -> str:
-    """A guideline's version: the beginning of its sha256; "" for none."""
-    return hashlib.sha256(text.encode()).hexdigest()[:12] if text else ""
-
-
-def guideline_event(text: str, actor: str) -> Event:
-    return row(f"guideline:{uuid.uuid4().hex}", "guideline", "", actor, {"text": text})
+def ignored(terms: Terms, overlap: int, guideline: api.Guideline) -> Iterator[str]:
+    """Which settings do not hold, since the store knows others: `overlap` and `guideline` do."""
+    if overlap != terms.policy.overlap:
+        yield (
+            f"labeler.overlap={terms.policy.overlap} is not used: an admin has set {overlap} on the page, and can "
+            "change it there"
+        )
+    if terms.guideline not in ("", guideline.text):
+        yield (
+            f"labeler.guideline is not used: the store has one already (version {guideline.version}), which an admin "
+            "can change on the page"
+        )

@@ -14,7 +14,7 @@ from prefrl.label.server.app import create_app
 from prefrl.label.server.clips import Clips
 from prefrl.label.server.questions import Policy
 from prefrl.label.server.security import LOOPBACK, Rules
-from prefrl.label.server.serve import WebServer
+from prefrl.label.server.serve import WebServer, check_tls
 from prefrl.label.server.service import Service, Terms
 from prefrl.protocols import ControlTask
 from prefrl.store import Store
@@ -67,10 +67,28 @@ class Site:
         """How many open questions all active people have skipped."""
         return self.service.desk.stuck(person.name for person in self.service.access.active())
 
-    def say_goodbye(self) -> None:
-        """Tell the pages that all is done, and let them ask once more."""
+    def open_queries(self) -> list[str]:
+        """The ids of questions without any answer but a skip."""
+        with self.service.store.log.reading() as connection:
+            return records.open_queries(connection)
+
+    def people_missing(self) -> str:
+        """Why the people who are there cannot answer everything, if it is so; for people to read."""
+        overlap, there = self.service.desk.policy.overlap, len(self.service.access.active())
+        if not there:
+            return "; nobody can answer just now: let somebody in again on the page"
+        short = self.service.terms.fixed and there < overlap  # a round goes on with one answer to each
+        return f"; each needs {overlap} different people: invite more on the page" if short else ""
+
+    def say_goodbye(self) -> bool:
+        """Tell the pages that all is done, and let them ask once more; whether all is done still.
+
+        An answer may be taken back until the end, and is waited for again.
+        """
         self.service.finished = True
         time.sleep(GOODBYE_SECONDS)
+        self.service.finished = self.left() <= 0
+        return self.service.finished
 
     def wait(self, seconds: float) -> None:
         """Until the next answer, but no longer than about this."""
@@ -89,10 +107,10 @@ class Site:
 def open_site(labeler: WebLabeler, store: Store[Any]) -> Site:
     """Open the service, and serve it. Raises `ConfigError` where the address is taken."""
     settings = labeler.settings
+    tls = check_tls(settings.tls_cert, settings.tls_key)
     store.log.reserve()
     clips = Clips(store.folder, settings.clips) if labeler.task.kind == "control" else None
     service = Service(store, terms_of(labeler), clips)
-    tls = (settings.tls_cert, settings.tls_key) if settings.tls_cert and settings.tls_key else None
     server = WebServer(create_app(service, Rules(frozenset(hosts(labeler)))), tls)
     service.open()
     site = Site(service, clips, server)
@@ -103,7 +121,11 @@ def open_site(labeler: WebLabeler, store: Store[Any]) -> Site:
         host = "127.0.0.1" if settings.host in EVERYWHERE else settings.host
         name = f"[{host}]" if ":" in host else host
         site.address = f"{'https' if tls else 'http'}://{name}:{port}/"
-        site.notes = [f"label here: {site.address}#{_invite(service, settings.name)}", *warnings(labeler)]
+        site.notes = [
+            f"label here: {site.address}#{_invite(service, settings.name)}",
+            *service.notes,
+            *warnings(labeler),
+        ]
     except BaseException:
         site.close()
         raise
@@ -130,8 +152,9 @@ def terms_of(labeler: WebLabeler) -> Terms:
         policy=policy,
         strengths=dict(settings.strengths),
         guideline=settings.guideline,
+        consent=settings.consent,
         fps=cast(ControlTask, task).fps if task.kind == "control" else 0.0,
-        fixed=labeler.fixed,
+        fixed=labeler.fixed and not settings.stay_open,
         rate=settings.requests_per_second,
     )
 

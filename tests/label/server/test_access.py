@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 from web_service import browser, invite, log_in, serving
 
 from prefrl.label.server.access import Access, check_name, digest
+from prefrl.label.server.people import cookie_name
 from prefrl.label.server.service import Service
 from prefrl.store import Store
 from prefrl.types import Segment
@@ -23,13 +26,13 @@ def service(store: Store[Segment]) -> Iterator[Service]:
 def test_a_link_can_be_exchanged_for_a_session_and_a_session_cannot(service: Service) -> None:
     client = log_in(service, "ann")
     assert client.get("/api/me").json()["name"] == "ann"
-    stolen = client.cookies["prefrl"]
+    stolen = client.cookies[cookie_name(service)]
     assert browser(service).post("/api/session", json={"token": stolen}).status_code == 401
 
 
 def test_a_link_does_not_do_for_a_session(service: Service) -> None:
     client = browser(service)
-    client.cookies.set("prefrl", invite(service, "ann"))
+    client.cookies.set(cookie_name(service), invite(service, "ann"))
     assert client.get("/api/me").status_code == 401
 
 
@@ -49,20 +52,37 @@ def test_the_session_cookie_is_out_of_reach_of_scripts_and_other_sites(service: 
 
 def test_logging_out_ends_this_session_and_no_other(service: Service) -> None:
     one, other = log_in(service, "ann"), log_in(service, "ann")
-    cookie = one.cookies["prefrl"]
+    cookie = one.cookies[cookie_name(service)]
     assert one.delete("/api/session").status_code == 204
-    one.cookies.set("prefrl", cookie)
+    one.cookies.set(cookie_name(service), cookie)
     assert one.get("/api/me").status_code == 401
     assert other.get("/api/me").status_code == 200
 
 
 def test_people_and_sessions_outlive_a_restart(store: Store[Segment]) -> None:
     with serving(store) as service:
-        cookie = log_in(service, "ann").cookies["prefrl"]
+        cookie = log_in(service, "ann").cookies[cookie_name(service)]
     with serving(store) as service:
         client = browser(service)
-        client.cookies.set("prefrl", cookie)
+        client.cookies.set(cookie_name(service), cookie)
         assert client.get("/api/me").json()["name"] == "ann"
+
+
+def test_a_browser_is_logged_in_to_two_projects_of_one_host(tmp_path: Path) -> None:
+    with Store[Any](tmp_path / "one") as one, Store[Any](tmp_path / "other") as other:
+        with serving(one, "text") as first, serving(other, "text") as second:
+            here, there = log_in(first, "ann"), log_in(second, "ben")
+            here.cookies.update(there.cookies)
+            there.cookies.update(here.cookies)
+            assert len(here.cookies) == 2
+            told = [client.get("/api/me").json() for client in (here, there)]
+            assert [one["name"] for one in told] == ["ann", "ben"]
+            assert told[0]["store"] != told[1]["store"]
+            assert here.delete("/api/session").status_code == 204
+            assert there.get("/api/me").status_code == 200
+            kept = told[1]["store"]
+        with serving(other, "text") as again:
+            assert log_in(again, "ben").get("/api/me").json()["store"] == kept
 
 
 def test_only_hashes_of_tokens_are_kept(service: Service, store: Store[Segment]) -> None:
@@ -70,7 +90,7 @@ def test_only_hashes_of_tokens_are_kept(service: Service, store: Store[Segment])
     client = log_in(service, "ben")
     kept = json.dumps([one | {"hash": ""} for one in store.log.since(0)])
     assert token not in kept
-    assert client.cookies["prefrl"] not in kept
+    assert client.cookies[cookie_name(service)] not in kept
     assert digest(token) in kept
     assert all(token.encode() not in path.read_bytes() for path in store.folder.glob("store.db*"))
 

@@ -12,6 +12,7 @@ from starlette.testclient import TestClient
 from web_service import answering, ask_for, browser, invite, log_in, serving
 
 from prefrl.label.server.app import routes
+from prefrl.label.server.people import cookie_name
 from prefrl.label.server.service import Service
 from prefrl.log import StoreFull
 from prefrl.store import Store
@@ -61,6 +62,18 @@ def test_texts_are_shown_in_the_order_that_the_log_keeps(text_store: Store[Respo
         assert [item["text"] for item in card["items"]] == [query.candidates[i].text for i in order]
 
 
+def test_a_text_that_breaks_off_within_a_character_is_shown_and_those_after_it(text_store: Store[Response]) -> None:
+    texts = ("cut emoji \ud83d", "\udc00whole \U0001f600")
+    text_store.ask([Query(tuple(Response("p\udfff", text) for text in texts))])
+    with serving(text_store, "text") as service:
+        ann = log_in(service, "ann")
+        [card] = ask_for(ann, 6)
+        assert card["prompt"] == "p\ufffd"
+        assert {item["text"] for item in card["items"]} == {"cut emoji \ufffd", "\ufffdwhole \U0001f600"}
+        assert ann.post("/api/answers", json=answering(card["assignment_id"])).status_code == 200
+        assert ann.get("/api/history").json()["entries"][0]["assignment"] == card
+
+
 def test_the_same_questions_come_after_a_reload_in_a_second_tab_and_after_a_restart(
     store: Store[Segment], make_query: Ask
 ) -> None:
@@ -69,10 +82,10 @@ def test_the_same_questions_come_after_a_reload_in_a_second_tab_and_after_a_rest
         ann = log_in(service, "ann")
         first = ask_for(ann, 3)
         assert ask_for(ann, 3) == first
-        cookie = ann.cookies["prefrl"]
+        cookie = ann.cookies[cookie_name(service)]
     with serving(store) as service:
         again = browser(service)
-        again.cookies.set("prefrl", cookie)
+        again.cookies.set(cookie_name(service), cookie)
         assert ask_for(again, 3) == first
         ben = log_in(service, "ben")
         assert not {q["query_id"] for q in ask_for(ben, 4)} & {q["query_id"] for q in first}
@@ -181,8 +194,11 @@ def test_the_same_submission_twice_is_one_answer_with_one_number(service: Servic
 def test_a_second_answer_to_a_question_changes_nothing(service: Service, ann: TestClient) -> None:
     card = ask_for(ann)[0]
     first = ann.post("/api/answers", json=answering(card["assignment_id"], "first")).json()
-    again = ann.post("/api/answers", json=answering(card["assignment_id"], "second")).json()
-    assert again == {"seq": first["seq"], "duplicate": True}
+    second = answering(card["assignment_id"], "second")
+    for _ in range(2):
+        assert ann.post("/api/answers", json=second).json() == {"seq": first["seq"], "duplicate": True}
+    assert ann.post("/api/answers", json=second | {"outcome": "tie"}).status_code == 409
+    assert len(service.store.answers()) == 1
 
 
 def test_nobody_can_answer_undo_or_report_for_somebody_else(service: Service, ann: TestClient) -> None:

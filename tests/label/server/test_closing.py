@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ from starlette.testclient import TestClient
 from stores import responses
 from web_service import answering, ask_for, browser, invite, log_in, serving
 
+from prefrl.label.server import records
 from prefrl.label.server.desk import Desk
+from prefrl.label.server.people import cookie_name
 from prefrl.label.server.questions import BETWEEN, Given, Past, Policy, Question
 from prefrl.store import Store
 
@@ -80,14 +83,14 @@ def test_an_answer_that_nobody_needs_any_more_is_kept(texts: Store[Any]) -> None
 def test_an_answer_that_comes_while_the_server_closes_can_be_sent_again_later(texts: Store[Any]) -> None:
     with serving(texts, "text") as service:
         ann = log_in(service, "ann")
-        cookie, sent = ann.cookies["prefrl"], answering(held(ann))
+        cookie, sent = ann.cookies[cookie_name(service)], answering(held(ann))
     refused = ann.post("/api/answers", json=sent)
     assert refused.status_code == 503
     assert int(refused.headers["retry-after"]) > 0
     assert answers(texts) == 0
     with serving(texts, "text") as service:
         again = browser(service)
-        again.cookies.set("prefrl", cookie)
+        again.cookies.set(cookie_name(service), cookie)
         receipts = [again.post("/api/answers", json=sent).json() for _ in range(2)]
     assert [one["duplicate"] for one in receipts] == [False, True]
     assert receipts[0]["seq"] == receipts[1]["seq"]
@@ -116,6 +119,33 @@ def test_after_a_restart_a_question_is_held_by_who_was_given_it_last() -> None:
         desk.tell(name, Past(given=1))
     assert desk.pick("ann", 1) == ([], [])
     assert desk.pick("ben", 1) == ([at_work], [])
+
+
+def test_what_a_run_asks_while_an_admin_changes_the_overlap_is_given_out(
+    texts: Store[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving(texts, "text") as service:
+        read = records.unanswered
+
+        def next_round() -> None:
+            texts.ask(responses(6))
+            service.refresh()
+
+        run = threading.Thread(target=next_round)
+
+        def slow(connection: Any) -> Any:
+            found = read(connection)
+            run.start()
+            run.join(0.5)
+            return found
+
+        boss = log_in(service, "boss", "admin")
+        with monkeypatch.context() as patch:
+            patch.setattr(records, "unanswered", slow)
+            assert boss.post("/api/admin/project", json={"overlap": 2}).status_code == 204
+        run.join()
+        assert service.desk.counts().asked == texts.counts()["asked"] == 6
+        assert len(ask_for(log_in(service, "ann"), 6)) == 6
 
 
 def test_of_two_admins_who_invite_the_same_name_at_once_the_first_one_stands(texts: Store[Any]) -> None:

@@ -96,12 +96,44 @@ def test_a_sign_of_life_keeps_a_lease() -> None:
 
 def test_a_skipped_question_goes_to_somebody_else_and_never_back() -> None:
     made = desk(asked(1), "ann", "ben")
-    made.answered(made.pick("ann", 1)[1][0], 0)
+    made.answered(made.pick("ann", 1)[1][0], 0, skipped=True)
     assert made.pick("ann", 1) == ([], [])
     assert made.stuck(["ann"]) == 1
     assert made.stuck(["ann", "ben"]) == 0
     made.answered(made.pick("ben", 1)[1][0], 1)
+    assert made.stuck(["ann", "ben"]) == 0
     assert made.counts().answered == 1
+
+
+def test_a_question_that_was_given_and_left_is_not_stuck() -> None:
+    clock = Clock()
+    made = desk(asked(2), "ann", clock=clock, lease_seconds=60)
+    given = made.pick("ann", 2)[1]
+    clock.now += 61
+    assert made.stuck(["ann"]) == 0
+    assert made.pick("ann", 2) == (given, [])
+    made.answered(given[0], 0, skipped=True)
+    assert made.stuck(["ann"]) == 1
+    assert made.stuck([]) == 0
+
+
+def test_a_question_that_needs_other_people_is_not_stuck() -> None:
+    made = desk(asked(1), "ann", "ben", overlap=2)
+    made.answered(made.pick("ann", 1)[1][0], 1)
+    assert made.stuck(["ann"]) == 0
+    made.answered(made.pick("ben", 1)[1][0], 1, skipped=True)
+    assert made.stuck(["ben"]) == made.stuck(["ann", "ben"]) == 0
+
+
+def test_a_skip_that_is_taken_back_leaves_nothing_stuck() -> None:
+    clock = Clock()
+    made = desk(asked(1), "ann", clock=clock)
+    given = made.pick("ann", 1)[1][0]
+    made.answered(given, 0, skipped=True)
+    assert made.stuck(["ann"]) == 1
+    made.reopened(given, Question(given.query, 1000, 1, 2, "label", 0, "ann"))
+    clock.now += 1000
+    assert made.stuck(["ann"]) == 0
 
 
 def test_an_answer_that_is_taken_back_is_the_next_question_of_the_same_person() -> None:

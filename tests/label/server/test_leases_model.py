@@ -340,6 +340,14 @@ class Labelling(RuleBasedStateMachine):
         assert (counts.asked, counts.answered) == (asked, closed) == (len(self.known.asked), self.known.closed())
 
     @invariant()
+    def stuck_is_what_all_have_skipped(self) -> None:
+        people = [name for name in PEOPLE if name not in self.paused]
+        words = {(one.name, one.query): one.outcome for one in self.known.tasks.values() if one.purpose == "label"}
+        untouched = [one for one in self.known.asked if not (self.known.answers(one) or self.leases(one))]
+        skipped = [one for one in untouched if people and all(words.get((name, one)) == "skip" for name in people)]
+        assert self.service.desk.stuck(people) == len(skipped)
+
+    @invariant()
     def progress_is_what_was_done(self) -> None:
         for name in PEOPLE:
             told = self.run(self.service.progress(name))

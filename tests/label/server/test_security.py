@@ -15,6 +15,7 @@ import pytest
 from starlette.testclient import TestClient
 from web_service import ORIGIN, answering, ask_for, browser, invite, log_in, serving
 
+from prefrl.label.server.people import cookie_name
 from prefrl.label.server.security import BODY, HEADERS, Buckets, Guard, Refused, Rules, check_host
 from prefrl.label.server.service import Service
 from prefrl.store import Store
@@ -358,7 +359,7 @@ def test_no_token_and_no_text_reaches_a_log(service: Service, caplog: pytest.Log
         client = browser(service)
         client.post("/api/session", json={"token": token})
         client.post("/api/answers", json=answering(ask_for(client)[0]["assignment_id"], comment="a private remark"))
-    for secret in (token, client.cookies["prefrl"], "private remark"):
+    for secret in (token, client.cookies[cookie_name(service)], "private remark"):
         assert secret not in caplog.text
 
 

@@ -14,7 +14,7 @@ import { Session } from "./session.js";
 import { dress, settings } from "./settings.js";
 import { t } from "./strings.js";
 import { toast } from "./toast.js";
-import { Guide, welcome } from "./welcome.js";
+import { Consent, Guide, welcome } from "./welcome.js";
 
 const root = document.getElementById("app");
 const session = new Session();
@@ -26,8 +26,12 @@ const app = { session, outbox, pace, go, guideline, help, settings: () => settin
 let page = null;
 let view = null;
 
+/** True where nothing is shown before a person has agreed. */
+const gated = (path) => path !== "/guide" && path !== "/admin";
+
 /** The view of an address; the administration is fetched only by those who may see it. */
 async function make(path, extra) {
+  if (session.state.consent && gated(path)) return new Consent(app);
   if (path === "/history") return new History(app);
   if (path === "/guide") return new Guide();
   if (path === "/admin" && session.me.role === "admin") return new (await import("./admin.js")).Admin(app);
@@ -67,13 +71,21 @@ async function guideline(notice = "") {
   }
 }
 
+/** What must be agreed to comes before all else, also while somebody is at work. */
+async function offerConsent() {
+  const owed = Boolean(session.state.consent);
+  if (!page || !view || owed === view instanceof Consent || !gated(location.pathname)) return;
+  await show();
+  offerGuideline();
+}
+
 /** A guideline that is new to this browser is put before the person, once. */
 let offered = "";
 function offerGuideline() {
   const version = session.state.guideline;
   const read = settings.get("guideline");
-  const admin = location.pathname === "/admin";
-  if (!version || version === read || version === offered || admin || document.querySelector("dialog[open]")) return;
+  const busy = location.pathname === "/admin" || view instanceof Consent || document.querySelector("dialog[open]");
+  if (!version || version === read || version === offered || busy) return;
   offered = version;
   guideline(read ? t("guide.changed") : t("guide.first"));
 }
@@ -88,7 +100,7 @@ async function start() {
   }
   page = frame(app);
   put(root, page.element);
-  await outbox.start(session.me.name);
+  await outbox.start(session.me.name, session.me.store);
   await show();
   offerGuideline();
 }
@@ -103,6 +115,7 @@ function signedOut() {
 }
 
 session.addEventListener("signedout", signedOut);
+session.addEventListener("state", offerConsent);
 session.addEventListener("state", offerGuideline);
 session.addEventListener("online", () => outbox.hurry());
 outbox.addEventListener("signedout", signedOut);

@@ -16,7 +16,7 @@ export class Desk extends EventTarget {
 
   #sent;
 
-  /** `sent(id)` tells whether an answer to a question is on its way already. */
+  /** `sent()` gives the questions to which an answer is on its way already. */
   constructor(sent) {
     super();
     this.#sent = sent;
@@ -58,9 +58,11 @@ export class Desk extends EventTarget {
 
   async #fetch() {
     const before = this.#showing();
+    const sent = this.#sent(); // an answer may overtake this request, and be gone from there when it is done
     try {
       const { assignments, reason } = await post("/api/assignments", { want: WANT });
-      this.#merge(assignments.filter(({ assignment_id: id }) => !this.#answered.has(id) && !this.#sent(id)));
+      const done = new Set([...sent, ...this.#sent(), ...this.#answered]);
+      this.#merge(assignments.filter(({ assignment_id: id }) => !done.has(id)));
       this.reason = this.held.length ? null : reason;
       this.error = null;
     } catch (error) {

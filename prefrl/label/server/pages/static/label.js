@@ -39,7 +39,7 @@ export class Labelling {
   /** `app` is {session, outbox, pace, guideline(), help()}; `reopened` an answer taken back in the history. */
   constructor(app, reopened = null) {
     this.#app = app;
-    this.#desk = new Desk((id) => app.outbox.answers(id));
+    this.#desk = new Desk(() => app.outbox.answering);
     if (reopened) this.#reopen(reopened);
   }
 

@@ -10,6 +10,7 @@ const SIGNS = {
   "read-only": "warning",
   offline: "cloudOff",
   trouble: "warning",
+  consent: "spinner",
   sending: "spinner",
   loading: "spinner",
 };
@@ -21,6 +22,7 @@ const TEXTS = () => ({
   "read-only": [t("wait.read-only.title"), t("wait.read-only")],
   offline: [t("wait.offline.title"), t("wait.offline")],
   trouble: [t("wait.trouble.title"), t("wait.trouble")],
+  consent: [t("wait.loading.title"), ""],
   sending: [t("wait.sending.title"), t("wait.sending")],
   loading: [t("wait.loading.title"), ""],
 });

@@ -15,26 +15,30 @@ export class Outbox extends EventTarget {
   items = [];
   #depot = null;
   #who = "";
+  #store = "";
   #sending = false;
   #wait = 0;
   #timer = 0;
   #ever = false;
 
-  /** Take up what an earlier page left behind, and go on sending it. */
-  async start(who) {
+  /** Take up what an earlier page left behind, and go on sending it. One address may serve different stores in turn. */
+  async start(who, store) {
     this.#who = who;
+    this.#store = store;
     this.#depot ??= guarded(await openDepot());
-    const kept = (await this.#depot.all()).filter((item) => item.who === who && !this.#has(item.id));
-    // What another page kept may have been sent by it; what another person kept waits for that person's link.
+    const mine = (item) => item.who === who && item.store === store;
+    const kept = (await this.#depot.all()).filter((item) => mine(item) && !this.#has(item.id));
+    // What another page kept may have been sent by it; what was kept for other people or stores waits for their links.
     const older = kept.sort((a, b) => a.at - b.at).map((item) => ({ ...item, tries: item.tries + 1 }));
-    this.items = [...older, ...this.items.filter((item) => item.who === who)];
+    this.items = [...older, ...this.items.filter(mine)];
     this.#changed();
     this.hurry();
   }
 
   /** File something under `path`; it is held from now on, and sent as soon as it is kept. */
   add(path, body) {
-    const item = { id: body.submission_id, path, body, who: this.#who, at: Date.now(), refused: "", tries: 0 };
+    const sender = { who: this.#who, store: this.#store };
+    const item = { id: body.submission_id, path, body, ...sender, at: Date.now(), refused: "", tries: 0 };
     this.items.push(item);
     this.#changed();
     this.#depot.put(item).then(() => this.hurry());
@@ -55,10 +59,14 @@ export class Outbox extends EventTarget {
     if (item) await this.#drop(item);
   }
 
-  /** True where the last thing on its way about a question is an answer: the server may still call it open. */
-  answers(assignment) {
-    const last = this.unsent.findLast((item) => item.body.assignment_id === assignment && item.path !== "/api/flags");
-    return last?.path === "/api/answers";
+  /** Questions of which the last thing on its way is an answer: the server may still call them open. */
+  get answering() {
+    const found = new Set();
+    for (const { path, body } of this.unsent) {
+      if (path === "/api/answers") found.add(body.assignment_id);
+      if (path === "/api/undo") found.delete(body.assignment_id);
+    }
+    return found;
   }
 
   get unsent() {

@@ -22,6 +22,7 @@ export class Session extends EventTarget {
       seq: 0,
       progress: this.me.progress,
       guideline: this.me.guideline,
+      consent: this.me.consent,
       paused: false,
       read_only: false,
       finished: false,
