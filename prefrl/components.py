@@ -30,6 +30,10 @@ class Settings(BaseModel):
         """The same with as little work as still makes sense: for dry runs and tests."""
         return self
 
+    def lasting(self) -> Self:
+        """The same without what may change from one start of a run to the next, such as a port."""
+        return self
+
     def work(self) -> float:
         """How much a round takes, in any unit: a dry run compares it with that of the shrunk settings."""
         return 1.0

@@ -236,10 +236,15 @@ def _claim(config: Config, folder: Path, store: Store[Any]) -> None:
     """
     path = folder / "config.yaml"
     begun = bool(_checkpoints(folder)) or store.sequence > 0
-    if path.exists() and begun and (found := Config.load(path)) != config:
-        difference = _difference(found, config)
+    found = Config.load(path) if path.exists() and begun else config
+    if _lasting(found) != _lasting(config):
+        difference = _difference(_lasting(found), _lasting(config))
         raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")
     write_file(path, config.dump().encode())
+
+
+def _lasting(config: Config) -> Config:
+    return config.model_copy(update={name: part.lasting() for name, part in config if isinstance(part, Settings)})
 
 
 def _hash(saved: Path) -> str:

@@ -6,7 +6,7 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -112,6 +112,11 @@ class WebSettings(Settings):
         if self.check_share + self.repeat_share >= 1:
             raise ValueError("check_share and repeat_share together must leave room for questions")
         return self
+
+    def lasting(self) -> Self:
+        """Where the page is served may change, when a port is taken say."""
+        place = ("host", "port", "allowed_hosts", "tls_cert", "tls_key")
+        return self.model_copy(update={name: type(self).model_fields[name].default for name in place})
 
     def build(self, task: Task) -> WebLabeler:
         return WebLabeler(self, task)

@@ -23,7 +23,7 @@ from prefrl.label.server import serve
 from prefrl.label.server.site import hosts, warnings
 from prefrl.label.web import WebLabeler, WebSettings
 from prefrl.protocols import Attended
-from prefrl.rundir import Run
+from prefrl.rundir import Run, RunError
 from prefrl.stages import label
 from prefrl.stages import serve as serve_folder
 from prefrl.store import Store
@@ -207,6 +207,18 @@ def test_a_port_that_is_taken_is_named_and_nothing_is_left_open(asked: Store[Seg
             made.open(asked)
     made.close()
     assert not [t for t in threading.enumerate() if t.name.startswith("prefrl-")]
+
+
+def test_a_run_goes_on_at_another_address_and_with_no_other_setting(tmp_path: Path) -> None:
+    web = ("labeler.kind=web", "labeler.port=0")
+    with Run(Config.load("control/toy", web), tmp_path / "run") as run:
+        assert run.store.sequence > 0
+    elsewhere = Config.load("control/toy", (*web, "labeler.allowed_hosts=[lab.example.org]"))
+    Run(elsewhere, tmp_path / "run").close()
+    with Run.resume(tmp_path / "run") as run:
+        assert run.config == elsewhere
+    with pytest.raises(RunError, match=r"labeler\.enough"):
+        Run(Config.load("control/toy", (*web, "labeler.enough=0.9")), tmp_path / "run")
 
 
 def test_closing_takes_seconds_even_with_open_connections(
