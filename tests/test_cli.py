@@ -178,7 +178,7 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
             child.stdout.readline()
         time.sleep(0.2)
         child.send_signal(signal.SIGINT)
-        rest, errors = child.communicate(timeout=30)
+        rest, errors = child.communicate(timeout=60)
     assert child.returncode == 130
     assert "prefrl resume run" in rest.replace("\n", " ")
     assert "Traceback" not in errors

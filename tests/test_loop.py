@@ -211,7 +211,7 @@ def test_a_pool_that_is_too_small_is_noted_and_none_at_all_says_what_to_change(s
 
 def test_what_was_asked_before_is_not_asked_again_and_a_round_done_again_asks_the_same(tmp_path: Path) -> None:
     loop = build("control/toy", tmp_path, "loop.labels=8", "loop.rounds=4", "loop.first_share=0.25")
-    pool = list({c.episode: c for c in loop.learner.sample(200, np.random.default_rng(0))}.values())[:13]
+    pool = list(loop.learner.sample(200, np.random.default_rng(0)))[:13]
 
     class Stubborn(Blind):
         """Does the same each time."""
