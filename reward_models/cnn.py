@@ -17,7 +17,8 @@ from prefrl.components import ConfigError, Settings
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
-from prefrl.reward_models.steps import StepReward, control, each_input, uniform
+from prefrl.reward_models.network import CACHED, uniform
+from prefrl.reward_models.steps import StepReward, control, each_input
 from prefrl.seeding import draw_seed
 
 
@@ -65,7 +66,7 @@ class CNN:
     memory, first = 1, None
 
     def __init__(self, settings: CNNSettings, actions: int, generator: torch.Generator) -> None:
-        self.members, self._image = settings.members, settings.image
+        self.members, self.most, self._image = settings.members, CACHED // settings.members, settings.image
         height, width, channels = settings.image
         pairs = list(pairwise((channels, *settings.channels)))
         self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, generator) for i, o in pairs]
@@ -88,7 +89,7 @@ class CNN:
             x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else len(steps)))
         seen = x.reshape(len(x), self.members, -1).transpose(0, 1)
         both = torch.cat([seen, steps[:, :, pixels:].expand(self.members, -1, -1)], 2)
-        return self._head.of_members(both).view(self.members, *inputs.shape[-3:-1])
+        return self._head.of_steps(both).view(self.members, *inputs.shape[-3:-1])
 
 
 def _check(image: tuple[int, int, int], task: ControlTask) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from prefrl.components import Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
+from prefrl.reward_models.network import CACHED
 from prefrl.reward_models.steps import StepReward, control
 from prefrl.types import Floats
 
@@ -53,7 +54,7 @@ class Linear:
     memory = 1
 
     def __init__(self, settings: LinearSettings, inputs: int, rng: np.random.Generator) -> None:
-        self.members, self._prior_std = settings.members, settings.prior_std
+        self.members, self.most, self._prior_std = settings.members, CACHED // settings.members, settings.prior_std
         self._quadratic = settings.features == "quadratic"
         size = inputs + (inputs * (inputs + 1) // 2 if self._quadratic else 0)
         half = rng.standard_normal((settings.members // 2, size))

@@ -14,11 +14,10 @@ from torch import Tensor
 from prefrl.components import Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import StepReward, control, uniform
+from prefrl.reward_models.network import uniform
+from prefrl.reward_models.perceptron import Activation, perceptrons
+from prefrl.reward_models.steps import StepReward, control
 from prefrl.seeding import draw_seed
-
-ACTIVATIONS = {"tanh": torch.tanh_, "relu": torch.relu_, "silu": torch.nn.functional.silu}
-"""In place where the derivative can be had from the result: a fit's time goes into memory as much as into numbers."""
 
 
 class MLPSettings(Settings):
@@ -29,7 +28,7 @@ class MLPSettings(Settings):
     """E: how many networks, each from its own random start."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""
-    activation: Literal["tanh", "relu", "silu"] = "tanh"
+    activation: Activation = "tanh"
     """Between the layers."""
     gain: float = Field(10.0, gt=0)
     """A segment's raw score is this times the mean of its networks' outputs, when it has the task's usual length."""
@@ -46,11 +45,13 @@ class MLPSettings(Settings):
 class MLP:
     """A `Network`: E perceptrons with `sizes` (I, ..., 1) units, their weights stacked."""
 
-    memory = 1
+    memory, most = 1, 1_000_000  # it divides them itself, by its widths
 
-    def __init__(self, members: int, sizes: tuple[int, ...], activation: str, generator: torch.Generator) -> None:
+    def __init__(
+        self, members: int, sizes: tuple[int, ...], activation: Activation, generator: torch.Generator
+    ) -> None:
         pairs = list(pairwise(sizes))
-        self.members, self._activation = members, ACTIVATIONS[activation]
+        self.members, self._activation = members, activation
         self.weights = [uniform((members, i, o), i, generator) for i, o in pairs]
         self.biases = [uniform((members, 1, o), i, generator) for i, o in pairs]
 
@@ -63,11 +64,8 @@ class MLP:
         return self.weights[0], self.biases[0]
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        x = inputs.flatten(-3, -2).expand(self.members, -1, -1)
-        return self.of_members(x).view(self.members, *inputs.shape[-3:-1])
+        return self.of_steps(inputs.flatten(-3, -2)).view(self.members, *inputs.shape[-3:-1])
 
-    def of_members(self, x: Tensor) -> Tensor:
-        """(E, S, I) -> (E, S): each member with inputs of its own."""
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = self._activation(torch.baddbmm(bias, x, weight))
-        return torch.baddbmm(self.biases[-1], x, self.weights[-1])[:, :, 0]
+    def of_steps(self, x: Tensor) -> Tensor:
+        """(S, I), or (E, S, I), each member's own -> (E, S)."""
+        return perceptrons(x, self.weights, self.biases, self._activation)

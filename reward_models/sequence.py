@@ -14,7 +14,8 @@ from torch.nn.functional import gelu, layer_norm, scaled_dot_product_attention
 from prefrl.components import ConfigError, Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import StepReward, control, uniform
+from prefrl.reward_models.network import CACHED, uniform
+from prefrl.reward_models.steps import StepReward, control
 from prefrl.seeding import draw_seed
 
 
@@ -45,6 +46,7 @@ class GRU:
     def __init__(self, settings: GRUSettings, inputs: int, memory: int, rng: np.random.Generator) -> None:
         generator = torch.Generator().manual_seed(draw_seed(rng))
         self.members, self.memory, width = settings.members, memory, settings.width
+        self.most = CACHED // self.members
         shapes = {
             "input_weight": (inputs, 3 * width),
             "input_bias": (1, 3 * width),
@@ -126,7 +128,7 @@ class PreferenceTransformer:
         self, settings: PreferenceTransformerSettings, inputs: int, memory: int, rng: np.random.Generator
     ) -> None:
         generator = torch.Generator().manual_seed(draw_seed(rng))
-        self.members, self.memory = settings.members, memory
+        self.members, self.memory, self.most = settings.members, memory, CACHED // settings.members
         self._heads, self._layers, self._weighted = settings.heads, settings.layers, settings.preference_attention
         width = settings.width
         self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, generator)}

@@ -5,9 +5,7 @@ A network is small: it maps normalised steps to outputs, E members at once. All 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -17,39 +15,11 @@ from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.reward_models.history import looking_back
+from prefrl.reward_models.network import CACHED, Measure, Network, Solve
 from prefrl.types import Floats, Segment, State
 
-STEPS, NUMBERS = 4096, 4_194_304
-"""Steps of all members, and numbers in one's inputs, that go through at once: what is made of them stays in cache."""
-
-Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
-Solve: TypeAlias = Callable[[Tensor, Tensor, Callable[[Tensor], Tensor]], None]
-"""Fit a network without descent: normalised inputs (N, T, I), what a step counts in a score (N, T), the fit's loss."""
-
-
-class Network(Protocol):
-    """E members evaluated in one pass."""
-
-    @property
-    def members(self) -> int: ...
-
-    @property
-    def memory(self) -> int:
-        """How many steps an output looks at, its own included."""
-
-    def named(self) -> Mapping[str, Tensor]:
-        """Everything that is saved. What is a parameter is fitted by descent."""
-
-    def outputs(self, inputs: Tensor) -> Tensor:
-        """(B, T, I) normalised steps, T <= memory (or any where memory is 1), or (E, B, T, I), each member's own.
-
-        Returns (E, B, T). No step sees a later one.
-        """
-
-    @property
-    def first(self) -> tuple[Tensor, Tensor] | None:
-        """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+NUMBERS = 4_194_304
+"""In the inputs that go through a network at once."""
 
 
 class StepReward:
@@ -98,7 +68,7 @@ class StepReward:
         steps, lengths = self._steps(candidates), torch.tensor([len(c) for c in candidates])
         mask = torch.arange(int(lengths.max())) < lengths[:, None]
         self._rebase(steps)
-        steps = self._normalised(steps)
+        self._normalise_(steps)
         if mask.all():
             return {"inputs": steps.view(*mask.shape, -1), "mask": mask.float()}
         inputs = steps.new_zeros(*mask.shape, steps.shape[1])
@@ -163,7 +133,7 @@ class StepReward:
                 f"{observations.shape}, {actions.shape} and {marks.shape}"
             )
         marks[:, :1] = True
-        steps = self._normalised(self._inputs(observations, actions).flatten(0, 1))
+        steps = self._normalise_(self._inputs(observations, actions).flatten(0, 1))
         found = self._member_rewards(steps, marks.ravel()).numpy()
         return combine(found, self._ensemble, self._fits).reshape(shape)
 
@@ -203,7 +173,7 @@ class StepReward:
         """(E, S): `what` of the steps of all candidates, one after another."""
         steps, begins = self._steps(candidates), np.zeros(sum(len(c) for c in candidates), bool)
         begins[_starts(candidates)] = True
-        found: Floats = what(self._normalised(steps), begins).numpy()
+        found: Floats = what(self._normalise_(steps), begins).numpy()
         return found
 
     def _member_rewards(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
@@ -218,10 +188,12 @@ class StepReward:
 
     def _most(self, inputs: Tensor) -> int:
         """How many steps (..., I) go through at once."""
-        return max(1, min(STEPS // self.members, NUMBERS // inputs.shape[-1]))
+        return max(1, min(self.network.most, NUMBERS // inputs.shape[-1]))
 
-    def _normalised(self, steps: Tensor) -> Tensor:
-        return (steps - self._input_mean).div_(self._input_std)
+    def _normalise_(self, steps: Tensor) -> Tensor:
+        for piece in steps.split(CACHED):
+            piece.sub_(self._input_mean).div_(self._input_std)
+        return steps
 
     @torch.no_grad()
     def _rebase(self, steps: Tensor) -> None:
@@ -274,13 +246,10 @@ def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     """The mean and std of each input; a constant has std 1."""
     each = torch.full((1, len(steps)), 1 / len(steps))  # products are several times faster than mean and std over rows
     mean = (each @ steps)[0]
-    std = (each @ (steps - mean).square_())[0].sqrt()
+    squares = ((piece - mean).square_() for piece in steps.split(CACHED))
+    variance = sum((each[:, : len(piece)] @ piece)[0] for piece in squares)
+    std = torch.as_tensor(variance).sqrt()
     return mean, torch.where(std > 1e-6, std, 1.0)
-
-
-def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:
-    """torch.nn.Linear's default start: uniform within 1 / sqrt(fan in)."""
-    return torch.nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) / math.sqrt(fan_in))
 
 
 def control(task: Task, kind: str) -> ControlTask:

@@ -128,6 +128,7 @@ class _Descent(Generic[C]):
             {"params": self.parameters, "weight_decay": DECAY if adaptive else self.fitting.weight_decay},
             {"params": problem.likelihood.parameters(), "lr": RATE, "weight_decay": 0.0},
         ]
+        groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, self.fitting.learning_rate, fused=True)
         self.order = torch.Generator().manual_seed(draw_seed(rng))
         self.discriminator = Discriminator()
@@ -168,7 +169,7 @@ class _Descent(Generic[C]):
     def _step(self, loss: Tensor) -> None:
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.fitting.max_grad_norm)
+        norm = _shorten([p.grad for p in self.parameters if p.grad is not None], self.fitting.max_grad_norm)
         if not norm.isfinite():
             raise FloatingPointError(
                 f"the gradient of the reward model's loss is {float(norm)}, and the loss {float(loss.detach())}: "
@@ -188,6 +189,16 @@ class _Descent(Generic[C]):
 
     def _copies(self) -> list[Tensor]:
         return [p.detach().clone() for p in self._all()]
+
+
+def _shorten(gradients: list[Tensor], most: float) -> Tensor:
+    """Scale gradients so that together they are no longer than `most`; returns how long they were.
+
+    torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
+    """
+    norm = torch.stack(torch._foreach_norm(gradients)).norm()
+    torch._foreach_mul_(gradients, (most / (norm + 1e-6)).clamp(max=1.0))
+    return norm
 
 
 def _alternate(problem: Problem[C]) -> None:

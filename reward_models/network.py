@@ -1,0 +1,51 @@
+"""What a network is to `prefrl.reward_models.steps`: E members that say something of each step, in one pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol, TypeAlias
+
+import torch
+from torch import Tensor
+
+CACHED = 4096
+"""Steps of all members that go through a network at once, where it makes about a hundred numbers of each."""
+
+Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
+Solve: TypeAlias = Callable[[Tensor, Tensor, Callable[[Tensor], Tensor]], None]
+"""Fit a network without descent: normalised inputs (N, T, I), what a step counts in a score (N, T), the fit's loss."""
+
+
+class Network(Protocol):
+    """E members evaluated in one pass."""
+
+    @property
+    def members(self) -> int: ...
+
+    @property
+    def memory(self) -> int:
+        """How many steps an output looks at, its own included."""
+
+    @property
+    def most(self) -> int:
+        """How many steps go through at once, at most: what is made of them stays in cache."""
+
+    def named(self) -> Mapping[str, Tensor]:
+        """Everything that is saved. What is a parameter is fitted by descent."""
+
+    def outputs(self, inputs: Tensor) -> Tensor:
+        """(B, T, I) normalised steps, T <= memory (or any where memory is 1), or (E, B, T, I), each member's own.
+
+        Returns (E, B, T). No step sees a later one.
+        """
+
+    @property
+    def first(self) -> tuple[Tensor, Tensor] | None:
+        """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+
+
+def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:
+    """torch.nn.Linear's default start: uniform within 1 / sqrt(fan in)."""
+    return torch.nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) / math.sqrt(fan_in))
