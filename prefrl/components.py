@@ -98,6 +98,12 @@ def plugins(role: Role) -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=f"prefrl.{role}")}
 
 
+def feature_functions() -> dict[str, EntryPoint]:
+    """Hand-made features of control steps that installed packages bring, through the entry-point group
+    `prefrl.features`: functions (observations (S, O), actions (S, A)) -> (S, d)."""
+    return {point.name: point for point in entry_points(group="prefrl.features")}
+
+
 def kinds(role: Role) -> list[str]:
     return sorted({*TABLE[role], *plugins(role)})
 

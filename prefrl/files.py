@@ -67,12 +67,17 @@ def whole_folder(path: Path) -> Iterator[Path]:
     try:
         yield work
         files = sorted(p for p in work.rglob("*") if p.is_file())
-        hashes = {p.relative_to(work).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+        hashes = {p.relative_to(work).as_posix(): _sha256(p) for p in files}
         write_file(work / MANIFEST, json.dumps(hashes, indent=1).encode())
         _replace(path, work)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_free(path: Path) -> None:
@@ -124,7 +129,7 @@ def verify(folder: Path) -> None:
     try:
         hashes = json.loads((folder / MANIFEST).read_text())
         for name, expected in hashes.items():
-            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != expected:
+            if _sha256(folder / name) != expected:
                 raise DamagedError(f"{folder / name} does not have the sha256 that {MANIFEST} says: it was changed")
     except (OSError, ValueError) as error:
         if isinstance(error, DamagedError):

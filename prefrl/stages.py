@@ -247,7 +247,8 @@ def _write_rewardbench(subject: Subject, folder: Path) -> None:
         chosen, rejected = (pairs.candidates[i].prompt + pairs.candidates[i].text for i in (best, worst))
         if preference != 0.5:
             rows.append(ScoredPair(number, subject.data, chosen, rejected, float(scores[best]), float(scores[worst])))
-    write_rewardbench(folder, subject.model, rows)
+    backbone = getattr(subject.reward, "backbone", None)  # a reward model of another make has none
+    write_rewardbench(folder, subject.model, rows, chat=bool(backbone and backbone.chat))
 
 
 def write_card(card: ReportCard, data: Path | None, page: Path | None) -> None:

@@ -167,10 +167,11 @@ class ScoredPair(NamedTuple):
     score_rejected: float
 
 
-def write_rewardbench(folder: Path, model: str, rows: Sequence[ScoredPair]) -> dict[str, float]:
+def write_rewardbench(folder: Path, model: str, rows: Sequence[ScoredPair], chat: bool = False) -> dict[str, float]:
     """Write scores as RewardBench (Lambert et al. 2024) keeps its results; returns each subset's accuracy.
 
     `eval-set-scores/MODEL.json` has a list for each column, `eval-set/MODEL.json` the accuracies; a tie is an error.
+    `chat`: the texts were scored in the chat template of the model's tokenizer.
     Raises ValueError for a score that is not finite, and where there are no rows.
     """
     path = f"{model}.json"
@@ -178,7 +179,7 @@ def write_rewardbench(folder: Path, model: str, rows: Sequence[ScoredPair]) -> d
         raise ValueError(f"expected a model's name and at least one row, got {model!r} and {len(rows)} rows")
     if bad := [r.id for r in rows if not (math.isfinite(r.score_chosen) and math.isfinite(r.score_rejected))]:
         raise ValueError(f"RewardBench row {bad[0]}: expected finite scores, got NaN or infinity")
-    about = {"model": model, "model_type": "Seq. Classifier", "chat_template": "none"}
+    about = {"model": model, "model_type": "Seq. Classifier", "chat_template": "tokenizer" if chat else "none"}
     right = [int(r.score_chosen > r.score_rejected) for r in rows]
     subsets = sorted({r.subset for r in rows})
     accuracy = {s: float(np.mean([c for r, c in zip(rows, right, strict=True) if r.subset == s])) for s in subsets}

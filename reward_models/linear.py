@@ -11,16 +11,18 @@ from pydantic import Field
 from scipy.optimize import minimize
 from torch import Tensor
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings, feature_functions, suggest
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED
-from prefrl.reward_models.steps import StepReward, control
+from prefrl.reward_models.network import CACHED, Describe
+from prefrl.reward_models.steps import StepReward, control, described
 from prefrl.types import Floats
 
 STEPS = 200
 """Newton steps before giving up; a convex loss takes about ten."""
 Loss = Callable[[Tensor], Tensor]
+OWN = ("inputs", "quadratic")
+"""Features that need no other package."""
 
 
 class LinearSettings(Settings):
@@ -29,8 +31,9 @@ class LinearSettings(Settings):
     kind: Literal["linear"] = "linear"
     members: int = Field(8, ge=1)
     """E: draws from the posterior, in pairs around its mode; where E is odd, one is the mode itself."""
-    features: Literal["inputs", "quadratic"] = "inputs"
-    """A step's observation and action, standardised; or these, their squares less 1, and their products."""
+    features: str = "inputs"
+    """A step's observation and action, standardised (`inputs`); these, their squares less 1, and their products
+    (`quadratic`); or hand-made features, by their name in the entry-point group `prefrl.features`."""
     prior_std: float = Field(10.0, gt=0)
     """The prior's spread of a weight: by how many logits one standard deviation of a feature, kept up over a segment
     of the usual length, makes it better."""
@@ -38,9 +41,21 @@ class LinearSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
-        network = Linear(self, found.observation_size + found.action_size, rng)
-        return StepReward(network, found, 1.0, self.combine, solve=network.solve)
+        """Raises `ConfigError` for features that no installed package has."""
+        found, describe = control(task, self.kind), self._hand_made()
+        width = found.observation_size + found.action_size if describe is None else described(describe, found)
+        network = Linear(self, width, rng)
+        return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
+
+    def _hand_made(self) -> Describe | None:
+        if self.features in OWN:
+            return None
+        installed = feature_functions()
+        if self.features not in installed:
+            hint = suggest(self.features, [*OWN, *installed])
+            raise ConfigError(f"unknown reward.features {self.features!r}; {hint}")
+        function: Describe = installed[self.features].load()
+        return function
 
 
 class Linear:

@@ -9,6 +9,8 @@ from typing import Protocol, TypeAlias
 import torch
 from torch import Tensor
 
+from prefrl.types import Floats
+
 CACHED = 4096
 """Steps of all members that go through a network at once, where it makes about a hundred numbers of each."""
 
@@ -16,6 +18,9 @@ Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
 Solve: TypeAlias = Callable[[Tensor, Tensor, Callable[[Tensor], Tensor]], None]
 """Fit a network without descent: normalised inputs (N, T, I), what a step counts in a score (N, T), the fit's loss."""
+
+Describe: TypeAlias = Callable[[Floats, Floats], Floats]
+"""(S, O) observations and (S, A) actions -> (S, d) hand-made features, a network's inputs in their place."""
 
 
 class Network(Protocol):

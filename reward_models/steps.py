@@ -15,7 +15,7 @@ from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.reward_models.history import looking_back
-from prefrl.reward_models.network import CACHED, Measure, Network, Solve
+from prefrl.reward_models.network import CACHED, Describe, Measure, Network, Solve
 from prefrl.types import Floats, Segment, State
 
 NUMBERS = 4_194_304
@@ -38,10 +38,13 @@ class StepReward:
         ensemble: Ensemble,
         measure: Measure | None = None,
         solve: Solve | None = None,
+        describe: Describe | None = None,
     ) -> None:
         self.network, self._ensemble, self._measure, self._solve = network, ensemble, measure or each_input, solve
         self._sizes, self._gain = (task.observation_size, task.action_size), gain / task.segment_steps
-        self._input_mean, self._input_std = torch.zeros(sum(self._sizes)), torch.ones(sum(self._sizes))
+        self._describe = describe
+        width = sum(self._sizes) if describe is None else described(describe, task)
+        self._input_mean, self._input_std = torch.zeros(width), torch.ones(width)
         self._shift, self._scale = torch.zeros(network.members), torch.ones(network.members)
         self._temperature, self._fits = 1.0, 0
 
@@ -61,7 +64,7 @@ class StepReward:
         return [p for p in self.network.named().values() if isinstance(p, torch.nn.Parameter)]
 
     def stack(self, candidates: Sequence[Segment]) -> Mapping[str, Tensor]:
-        """Normalised inputs (N, T, O + A) and mask (N, T). Begins a fit: mean and std are measured here, and stay.
+        """Normalised inputs (N, T, I) and mask (N, T). Begins a fit: mean and std are measured here, and stay.
 
         Raises ValueError for a segment of other sizes than the task's.
         """
@@ -133,12 +136,12 @@ class StepReward:
                 f"{observations.shape}, {actions.shape} and {marks.shape}"
             )
         marks[:, :1] = True
-        steps = self._normalise_(self._inputs(observations, actions).flatten(0, 1))
+        steps = self._normalise_(self._inputs(observations, actions))
         found = self._member_rewards(steps, marks.ravel()).numpy()
         return combine(found, self._ensemble, self._fits).reshape(shape)
 
     def features(self, candidates: Sequence[Segment]) -> Floats:
-        """(N, 2 (O + A)): the mean and std of a segment's inputs over its steps, normalised as in the last fit.
+        """(N, 2 I): the mean and std of a segment's inputs over its steps, normalised as in the last fit.
 
         Before the first fit they are normalised by these candidates.
         """
@@ -191,7 +194,7 @@ class StepReward:
         return max(1, min(self.network.most, NUMBERS // inputs.shape[-1]))
 
     def _normalise_(self, steps: Tensor) -> Tensor:
-        for piece in steps.split(CACHED):
+        for piece in torch.split(steps, CACHED):
             piece.sub_(self._input_mean).div_(self._input_std)
         return steps
 
@@ -214,7 +217,7 @@ class StepReward:
         self._input_mean, self._input_std = mean, std
 
     def _steps(self, candidates: Sequence[Segment]) -> Tensor:
-        """(S, O + A): the steps of all candidates, one after another."""
+        """(S, I): the steps of all candidates, one after another."""
         if not len(candidates):
             raise ValueError("a reward model scores at least one segment at a time, got none")
         for one in candidates:
@@ -223,13 +226,23 @@ class StepReward:
         inside = steps.numpy()
         np.concatenate([c.observations for c in candidates], out=inside[:, : self._sizes[0]], casting="unsafe")
         np.concatenate([c.actions for c in candidates], out=inside[:, self._sizes[0] :], casting="unsafe")
-        return steps
+        return self._described(steps)
 
     def _inputs(self, observations: Floats, actions: Floats) -> Tensor:
-        """(..., O + A)."""
+        """(B, T, O) and (B, T, A) -> (B T, I)."""
         self._check(observations, actions)
         both = np.concatenate([observations, actions], -1, dtype=np.float32, casting="unsafe")
-        return torch.from_numpy(both)
+        return self._described(torch.from_numpy(both).flatten(0, 1))
+
+    def _described(self, steps: Tensor) -> Tensor:
+        """(S, O + A) -> (S, I): hand-made features in their place, where there are any."""
+        if self._describe is None:
+            return steps
+        observations, actions = np.split(steps.numpy(), self._sizes[:1], 1)
+        found = np.array(self._describe(observations, actions), np.float32)
+        if found.shape != (wanted := (len(steps), len(self._input_mean))):
+            raise ValueError(f"hand-made features of {len(steps)} steps must be of shape {wanted}, got {found.shape}")
+        return torch.from_numpy(found)
 
     def _check(self, observations: Floats, actions: Floats) -> None:
         if (observations.shape[-1], actions.shape[-1]) != self._sizes or not observations.size:
@@ -246,10 +259,22 @@ def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     """The mean and std of each input; a constant has std 1."""
     each = torch.full((1, len(steps)), 1 / len(steps))  # products are several times faster than mean and std over rows
     mean = (each @ steps)[0]
-    squares = ((piece - mean).square_() for piece in steps.split(CACHED))
+    squares = ((piece - mean).square_() for piece in torch.split(steps, CACHED))
     variance = sum((each[:, : len(piece)] @ piece)[0] for piece in squares)
     std = torch.as_tensor(variance).sqrt()
     return mean, torch.where(std > 1e-6, std, 1.0)
+
+
+def described(describe: Describe, task: ControlTask) -> int:
+    """How many features a function makes of a step of a task. Raises `ConfigError` where it makes none of it."""
+    observation, action = (np.zeros((1, size), np.float32) for size in (task.observation_size, task.action_size))
+    found = np.asarray(describe(observation, action))
+    if found.ndim != 2 or len(found) != 1 or not found.size or found.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"hand-made features: expected (S, d) real numbers for {observation.shape} observations and {action.shape} "
+            f"actions, got {found.dtype} of shape {found.shape}"
+        )
+    return int(found.shape[1])
 
 
 def control(task: Task, kind: str) -> ControlTask:

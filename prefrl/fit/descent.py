@@ -196,7 +196,7 @@ def _shorten(gradients: list[Tensor], most: float) -> Tensor:
 
     torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
     """
-    norm = torch.stack(torch._foreach_norm(gradients)).norm()
+    norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     torch._foreach_mul_(gradients, (most / (norm + 1e-6)).clamp(max=1.0))
     return norm
 

@@ -353,14 +353,18 @@ def test_ratings_and_comparisons_are_fitted_on_one_reward(make_segment: Callable
     assert pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic > 0.9
 
 
-def test_adaptive_weight_decay_keeps_overfitting_within_bounds(judged: list[Judged[Segment]]) -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_adaptive_weight_decay_keeps_overfitting_within_bounds(judged: list[Judged[Segment]], seed: int) -> None:
+    """From 1.1 to 1.5, give or take what an epoch moves before it is corrected."""
+
     def ratio(weight_decay: Any) -> float:
-        settings = FittingSettings(epochs=150, learning_rate=3e-3, held_out=0.3, weight_decay=weight_decay)
-        metrics = fit_judged(model(1), judged[:150], settings, np.random.default_rng(0)).metrics
+        settings = FittingSettings(epochs=300, learning_rate=3e-3, held_out=0.3, weight_decay=weight_decay)
+        part = judged[50 * seed : 50 * seed + 150]
+        metrics = fit_judged(model(1, seed), part, settings, np.random.default_rng(seed)).metrics
         return metrics["loss_held_out"] / metrics["loss"]
 
     assert ratio(0.0) > 2.0
-    assert 1.0 < ratio("adaptive") < 1.7
+    assert 1.05 < ratio("adaptive") < 1.6
 
 
 @pytest.mark.parametrize("denoise", ["filter", "flip"])
@@ -382,19 +386,24 @@ def test_wrong_labels_harm_less_when_improbable_ones_are_filtered(
     assert recovered(denoise=denoise) > recovered() + 0.02
 
 
-def test_pairs_nobody_judged_add_to_a_few_that_were(
+def test_pairs_nobody_judged_make_the_model_surer_of_their_like_and_no_worse(
     judged: list[Judged[Segment]], make_segment: Callable[..., Segment]
 ) -> None:
     few, others = judged[:40], [make_segment() for _ in range(300)]
     fresh = [make_segment() for _ in range(300)]
 
-    def recovered(**settings: Any) -> float:
+    def fitted(**settings: Any) -> tuple[float, float]:
+        """How well fresh segments are scored, and how sure the members are of fresh pairs."""
         reward = model()
         fitting = FittingSettings(epochs=80, held_out=0.0, weight_decay=0.1, **settings)
         fit_judged(reward, few, fitting, np.random.default_rng(0), others)
-        return float(pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic)
+        raw = reward.raw_member_scores(fresh)
+        sure = float(np.abs(raw[:, ::2] - raw[:, 1::2]).mean())
+        return float(pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic), sure
 
-    assert recovered(pseudo_labels=1.0, confidence=0.9, crop=0.2) > recovered() - 0.02
+    (alone, sure_alone), (both, sure_both) = fitted(), fitted(pseudo_labels=1.0, confidence=0.8)
+    assert sure_both > 1.1 * sure_alone
+    assert both > alone - 0.03
 
 
 def linear() -> Any:

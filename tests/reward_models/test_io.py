@@ -345,6 +345,9 @@ def test_rewardbench_files_have_its_columns_and_count_ties_as_errors(tmp_path: P
     summary = json.loads((tmp_path / "eval-set" / "us" / "mine.json").read_text())
     assert summary["hep-go"] == 0.5
     assert summary["model"] == "us/mine"
+    assert summary["chat_template"] == "none"
+    write_rewardbench(tmp_path, "us/mine", rows, chat=True)
+    assert json.loads((tmp_path / "eval-set" / "us" / "mine.json").read_text())["chat_template"] == "tokenizer"
 
 
 def test_rewardbench_wants_finite_scores_and_a_name_within_its_folder(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 from scipy.optimize import approx_fprime, minimize
 from torch.nn.functional import softplus
 
+from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings
 from prefrl.reward_models.linear import Linear, LinearSettings
 from prefrl.reward_models.steps import StepReward
@@ -150,3 +151,50 @@ def test_a_candidate_that_is_not_finite_is_an_error_that_says_so() -> None:
     segments[2].observations[0, 0] = np.inf
     with pytest.raises(ValueError, match="candidate 2 of the fit has features that are not finite"):
         model.settle(model.stack(segments), lambda scores: softplus(scores).sum(1))
+
+
+def _bring(monkeypatch: pytest.MonkeyPatch, **functions: Any) -> None:
+    """As if an installed package brought these features."""
+
+    class Point:
+        def __init__(self, function: Any) -> None:
+            self.load = lambda: function
+
+    points = {name: Point(function) for name, function in functions.items()}
+    monkeypatch.setattr("prefrl.reward_models.linear.feature_functions", lambda: points)
+
+
+def test_hand_made_features_take_the_place_of_the_inputs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reward of a distance and of a product is linear in these two, and not in the inputs."""
+
+    def made(observations: Floats, actions: Floats) -> Floats:
+        return np.stack([np.abs(observations[:, 0]), observations[:, 1] * actions[:, 0]], 1)
+
+    _bring(monkeypatch, made=made)
+    model, plain = _model(features="made"), _model()
+    rng = np.random.default_rng(0)
+    segments, fresh = _segments(400, rng), _segments(200, rng)
+
+    def gold(some: list[Segment]) -> Floats:
+        return np.array([(made(s.observations, s.actions) @ [-2.0, 1.0]).mean() for s in some])
+
+    values = gold(segments)
+    signs = torch.from_numpy(np.sign(values[::2] - values[1::2]))
+    for one in (model, plain):
+        one.settle(one.stack(segments), lambda s: softplus(-signs * (s[:, ::2] - s[:, 1::2])).sum(1))
+    assert np.corrcoef(model.score(fresh), gold(fresh))[0, 1] > 0.99
+    assert abs(np.corrcoef(plain.score(fresh), gold(fresh))[0, 1]) < 0.5
+    rewards = model.rewards(fresh[0].observations[None], fresh[0].actions[None])
+    np.testing.assert_allclose(rewards.sum(), model.score(fresh[:1])[0], rtol=1e-4)
+    assert _network(model).named()["weight"].shape == (8, 2, 1)
+
+
+def test_features_that_are_not_there_or_not_of_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"unknown reward\.features 'quadratc'; did you mean 'quadratic'"):
+        _model(features="quadratc")
+    _bring(monkeypatch, flat=lambda o, a: o[:, 0], odd=lambda o, a: o[: len(o) // 2 + 1])
+    with pytest.raises(ConfigError, match=r"expected \(S, d\) real numbers .* got float32 of shape \(1,\)"):
+        _model(features="flat")
+    model = _model(features="odd")
+    with pytest.raises(ValueError, match=r"features of 10 steps must be of shape \(10, 3\), got \(6, 3\)"):
+        model.stack(_segments(2, np.random.default_rng(0)))

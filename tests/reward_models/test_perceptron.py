@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ def _layers(members: int, sizes: tuple[int, ...]) -> tuple[list[Tensor], list[Te
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64).requires_grad_()
 
-    pairs = list(zip(sizes, sizes[1:], strict=False))
+    pairs = list(pairwise(sizes))
     return [normal(members, i, o) for i, o in pairs], [normal(members, 1, o) for _, o in pairs]
 
 
