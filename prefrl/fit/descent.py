@@ -29,8 +29,9 @@ UNJUDGED = 4
 """Pairs nobody judged for each judgement in a gradient step, as in SURF."""
 OVERFIT = (1.1, 1.5)
 """Where adaptive weight decay keeps the held-out over the training loss (Christiano et al. 2017, section 2.2.3)."""
-DECAY, DECAY_STEP, DECAY_BOUNDS = 0.01, 1.5, (1e-4, 100.0)
-"""Where it begins, its factor from epoch to epoch, and how far it goes."""
+DECAY, DECAY_MORE, DECAY_LESS, DECAY_BOUNDS = 1.0, 1.3, 1.1, (0.1, 100.0)
+"""Where it begins, its factors from epoch to epoch (a loss follows slowly: what goes too far swings), and how far it
+goes: below 0.1 it does next to nothing, and would only take longer to come back."""
 ALTERNATIONS = 10
 """Turns between a reward that is solved for and what is learned beside it."""
 
@@ -180,7 +181,7 @@ class _Descent(Generic[C]):
     def _adapt(self) -> None:
         """More weight decay where the held-out loss is far above the training loss, less where it is near."""
         test, train = (ensemble_loss(self.problem, part) for part in (self.problem.test, self.problem.train))
-        factor = DECAY_STEP if test > OVERFIT[1] * train else 1 / DECAY_STEP if test < OVERFIT[0] * train else 1.0
+        factor = DECAY_MORE if test > OVERFIT[1] * train else 1 / DECAY_LESS if test < OVERFIT[0] * train else 1.0
         group, (least, most) = self.optimizer.param_groups[0], DECAY_BOUNDS
         group["weight_decay"] = min(max(group["weight_decay"] * factor, least), most)
 
