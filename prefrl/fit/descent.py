@@ -60,7 +60,7 @@ class Problem(Generic[C]):
         fitting, extra = self.fitting, self._unjudged(part, order)
         mentioned = torch.cat([part.candidates(), extra.flatten()])
         needed, here = torch.unique(mentioned, return_inverse=True)
-        stacked: Mapping[str, Tensor] = {name: x[needed] for name, x in self.stacked.items()}
+        stacked: Mapping[str, Tensor] = {name: x.index_select(0, needed) for name, x in self.stacked.items()}
         if fitting.crop:
             stacked = semi.crop(stacked, fitting.crop, order)
         counts, here_terms = weights(part, weight), part.over(here)
