@@ -96,8 +96,11 @@ class StepReward:
         count = max(1, int(used.sum(0).max()))
         first = used.T.long().argsort(stable=True, dim=1, descending=True)[:, :count]  # filled up with unused ones
         rows = max(1, self._most(inputs) // mask.shape[1])
-        parts = (inputs.index_select(0, at.flatten()).unflatten(0, at.shape) for at in torch.split(first, rows, 1))
-        outputs = torch.cat([self.network.outputs(part) for part in parts], 1)
+        own = (
+            inputs.index_select(0, at.flatten()).view(*at.shape, *inputs.shape[1:])
+            for at in torch.split(first, rows, 1)
+        )
+        outputs = torch.cat([self.network.outputs(each) for each in own], 1)
         sums = (outputs * mask[first]).sum(2) * self._gain
         return sums.new_zeros(used.T.shape).scatter(1, first, sums)
 
