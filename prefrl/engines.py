@@ -61,7 +61,7 @@ def disown(folder: Path, lock: FileLock) -> None:
 def writer(folder: Path, url: str | None) -> sql.Engine:
     """An engine of one connection, which does all writing and all checkpoints."""
     if url is not None:
-        engine = sql.create_engine(url, pool_size=1, max_overflow=0)
+        engine = _engine(folder, url, pool_size=1, max_overflow=0)
         if engine.dialect.name == "sqlite":
             _set_up(engine, writes=True, journal="WAL")
         else:
@@ -75,13 +75,25 @@ def writer(folder: Path, url: str | None) -> sql.Engine:
 def reader(folder: Path, url: str | None) -> sql.Engine:
     """An engine whose connections cannot write."""
     if url is not None:
-        engine = sql.create_engine(url, execution_options={"postgresql_readonly": True})
+        engine = _engine(folder, url, execution_options={"postgresql_readonly": True})
         if engine.dialect.name == "sqlite":
             _set_up(engine, writes=False, journal=None)
         return engine
     engine = _sqlite(folder, "ro", pool_size=4, max_overflow=16)
     _set_up(engine, writes=False, journal=None)
     return engine
+
+
+def _engine(folder: Path, url: str, **options: Any) -> sql.Engine:
+    """Raises `StoreError` for what is no URL of a database, or of one whose driver is not installed."""
+    try:
+        return sql.create_engine(url, **options)
+    except (sql.exc.ArgumentError, ModuleNotFoundError) as error:  # the URL may hold a password: it is not shown
+        raise StoreError(
+            f"the database of the store in {folder} cannot be used: {error}; expected a SQLAlchemy URL such as "
+            "postgresql+psycopg://user@host/name (in store.url, or as given), and its driver installed: "
+            "pip install 'prefrl[postgres]'"
+        ) from error
 
 
 def file_system(folder: Path) -> str:

@@ -159,3 +159,12 @@ def test_a_disk_that_fills_up_inside_a_savepoint_is_said_to_be_full(text_store: 
     with pytest.raises(StoreFull, match="is full"):
         fill()
     assert text_store.judged() == []
+
+
+@pytest.mark.parametrize("url", ["not a url", "foo+bar://somewhere"])
+def test_what_names_no_database_is_refused_without_a_word_of_it(tmp_path: Path, url: str) -> None:
+    (tmp_path / "store.url").write_text(url)
+    for use in (lambda: Store[Segment](tmp_path), lambda: verify_store(tmp_path)):
+        with pytest.raises(StoreError, match="expected a SQLAlchemy URL") as caught:
+            use()
+        assert url not in str(caught.value)
