@@ -5,6 +5,7 @@ from collections.abc import Callable
 import choix
 import numpy as np
 import pytest
+import statsmodels.api as sm
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -68,6 +69,72 @@ def test_rao_and_kupper_is_their_formula() -> None:
     scores = row(0.7, -0.4)
     assert rao_kupper(scores, target(1, 0), NO, tie).item() == pytest.approx(-math.log(win))
     assert rao_kupper(scores, target(0.5, 0.5), YES, tie).item() == pytest.approx(-math.log(1 - win - loss))
+
+
+@pytest.fixture
+def tournament(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) who met, among five, and (M,) what came of it: 1 the first won, 0 a tie, -1 the second won."""
+    pairs = np.array(list(itertools.combinations(range(5), 2)) * 40)
+    worth = np.array([0.9, 0.4, 0.0, -0.5, -0.8])
+    outcome = worth[pairs[:, 0]] - worth[pairs[:, 1]] + rng.logistic(size=len(pairs))
+    return pairs, np.where(np.abs(outcome) < 0.7, 0, np.sign(outcome)).astype(int)
+
+
+def most_likely(loss: Callable[..., torch.Tensor], pairs: np.ndarray, outcomes: np.ndarray) -> tuple[np.ndarray, float]:
+    """The scores (5,), the first of them 0, and the natural tie parameter that a likelihood of ours is highest at."""
+    scores = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+    tie = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    wanted = torch.as_tensor(np.stack([(outcomes + 1) / 2, (1 - outcomes) / 2], 1))
+    optimizer = torch.optim.LBFGS([scores, tie], max_iter=200, tolerance_grad=1e-10, line_search_fn="strong_wolfe")
+
+    def closure() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = loss(scores[torch.as_tensor(pairs)][None], wanted, torch.as_tensor(outcomes == 0), tie).sum()
+        value.backward()  # type: ignore[no-untyped-call]
+        return value
+
+    optimizer.step(closure)  # type: ignore[no-untyped-call]
+    return (scores - scores[0]).detach().numpy(), float(tie.detach())
+
+
+def test_davidson_is_highest_where_statsmodels_finds_his_log_linear_model(
+    tournament: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """Counts of a tournament are Poisson, with a level of its own for each pair (Fienberg and Larntz 1976)."""
+    pairs, outcomes = tournament
+    counts: dict[tuple[int, int, int], int] = dict.fromkeys(
+        ((i, j, o) for i, j in itertools.combinations(range(5), 2) for o in (1, 0, -1)), 0
+    )
+    for (i, j), o in zip(pairs.tolist(), outcomes.tolist(), strict=True):
+        counts[i, j, o] += 1
+    levels = list(itertools.combinations(range(5), 2))
+    design = np.zeros((len(counts), len(levels) + 4 + 1))
+    for row, (i, j, o) in zip(design, counts, strict=True):
+        row[levels.index((i, j))] = 1
+        for who, share in ((i, (1 + o) / 2), (j, (1 - o) / 2)):
+            if who:
+                row[len(levels) + who - 1] = share
+        row[-1] = o == 0
+    theirs = sm.GLM(np.array(list(counts.values())), design, family=sm.families.Poisson()).fit(tol=1e-12).params
+    scores, log_nu = most_likely(davidson, pairs, outcomes)
+    np.testing.assert_allclose(scores[1:], theirs[len(levels) : -1], atol=1e-5)
+    assert log_nu == pytest.approx(theirs[-1], abs=1e-5)
+
+
+def test_rao_and_kupper_is_highest_where_statsmodels_finds_its_ordered_logit(
+    tournament: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """Win, tie and loss are levels of a cumulative logit in the difference; told both ways round, its thresholds are
+    symmetric."""
+    pairs, outcomes = tournament
+    design = np.zeros((len(pairs), 5))
+    rows = np.arange(len(pairs))
+    design[rows, pairs[:, 0]], design[rows, pairs[:, 1]] = 1, -1
+    both, told = np.concatenate([design, -design])[:, 1:], np.concatenate([outcomes, -outcomes])
+    theirs = OrderedModel(told + 1, both, distr="logit").fit(method="bfgs", gtol=1e-9, disp=False).params
+    scores, tie = most_likely(rao_kupper, pairs, outcomes)
+    np.testing.assert_allclose(scores[1:], theirs[:4], atol=1e-4)
+    assert np.logaddexp(0, tie) == pytest.approx(-theirs[4], abs=1e-4)
 
 
 @pytest.mark.parametrize("size", [2, 3, 4])
