@@ -21,7 +21,7 @@ from prefrl.seeding import draw_seed
 
 
 class MLPSettings(Settings):
-    """An ensemble of multi-layer perceptrons over (observation, action), evaluated in one batched pass."""
+    """An ensemble of multi-layer perceptrons over (observation, action), evaluated by one call."""
 
     kind: Literal["mlp"] = "mlp"
     members: int = Field(3, ge=1)
