@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -77,12 +80,13 @@ def drive(running: Run) -> None:
             say(note, "yellow")
         person = running.config.labeler.model_dump()["kind"] in ("terminal", "web")
         try:
-            with progress(running.loop, quiet=person) as bar:
+            with progress(running.loop, quiet=person) as bar, interrupts() as check:
                 for round in running:
                     bar.update(bar.task_ids[0], completed=round.number)
                     console.print(round_line(round), soft_wrap=True)
                     for note in round.notes:
                         say(f"  {note}", "yellow")
+                    check()
         except KeyboardInterrupt:
             say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
             raise
@@ -92,6 +96,34 @@ def drive(running: Run) -> None:
             raise ValueError(
                 "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
             )
+
+
+@contextmanager
+def interrupts() -> Iterator[Callable[[], None]]:
+    """Gives a function that raises KeyboardInterrupt if Ctrl-C was pressed and came to nothing.
+
+    Python drops what is raised in a destructor or in a callback of a library, Ctrl-C too; it is then heard at the end
+    of a round. Only the main thread hears of signals; elsewhere nothing changes.
+    """
+    pressed = False
+
+    def heard(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if pressed:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    before = signal.signal(signal.SIGINT, heard)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before or signal.default_int_handler)
 
 
 def say(text: str, style: str = "") -> None:

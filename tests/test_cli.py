@@ -1,5 +1,6 @@
 """What a person meets at the command line: the commands as a shell runs them, and what they say."""
 
+import contextlib
 import json
 import re
 import signal
@@ -12,6 +13,7 @@ import pytest
 from shell import Shell
 
 from prefrl.components import TABLE, kinds
+from prefrl.console import interrupts
 
 
 def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
@@ -182,6 +184,16 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert child.returncode == 130
     assert "prefrl resume run" in rest.replace("\n", " ")
     assert "Traceback" not in errors
+
+
+def test_a_ctrl_c_that_a_library_swallowed_is_heard_at_the_end_of_a_round() -> None:
+    with interrupts() as check:
+        check()
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            check()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
