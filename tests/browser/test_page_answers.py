@@ -89,6 +89,7 @@ def test_the_end_is_said(tmp_path: Path, open_house: Open, visit: Visit) -> None
 def test_ten_answers_are_taken_back_skips_among_them(text_house: House, visit: Visit) -> None:
     ann = visit(text_house.link("ann"))
     given = [ann.press(key) for key in ("1", "2", "0", "s", "x", "1", "s", "2", "a", "d", "1", "2")]
+    ann.saved()  # or the last one is withdrawn before it was sent, and the log never hears of it
     for id in reversed(given[2:]):
         ann.page.keyboard.press("z")
         ann.question_is(id)
