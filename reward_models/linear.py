@@ -14,8 +14,8 @@ from torch import Tensor
 from prefrl.components import ConfigError, Settings, feature_functions, suggest
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED, Describe
-from prefrl.reward_models.steps import StepReward, control, described
+from prefrl.reward_models.network import CACHED, Describe, input_width
+from prefrl.reward_models.steps import StepReward, control
 from prefrl.types import Floats
 
 STEPS = 200
@@ -43,8 +43,7 @@ class LinearSettings(Settings):
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
         found, describe = control(task, self.kind), self._hand_made()
-        width = found.observation_size + found.action_size if describe is None else described(describe, found)
-        network = Linear(self, width, rng)
+        network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 
     def _hand_made(self) -> Describe | None:

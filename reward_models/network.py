@@ -6,9 +6,12 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from prefrl.components import ConfigError
+from prefrl.protocols import ControlTask
 from prefrl.types import Floats
 
 CACHED = 4096
@@ -49,6 +52,20 @@ class Network(Protocol):
     @property
     def first(self) -> tuple[Tensor, Tensor] | None:
         """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+
+
+def input_width(task: ControlTask, describe: Describe | None) -> int:
+    """I: how many numbers a network sees of a step. Raises `ConfigError` for features that are not of steps."""
+    if describe is None:
+        return task.observation_size + task.action_size
+    observation, action = (np.zeros((1, size), np.float32) for size in (task.observation_size, task.action_size))
+    found = np.asarray(describe(observation, action))
+    if found.ndim != 2 or len(found) != 1 or not found.size or found.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"hand-made features: expected (S, d) real numbers for {observation.shape} observations and {action.shape} "
+            f"actions, got {found.dtype} of shape {found.shape}"
+        )
+    return int(found.shape[1])
 
 
 def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:

@@ -15,7 +15,7 @@ from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.reward_models.history import looking_back
-from prefrl.reward_models.network import CACHED, Describe, Measure, Network, Solve
+from prefrl.reward_models.network import CACHED, Describe, Measure, Network, Solve, input_width
 from prefrl.types import Floats, Segment, State
 
 NUMBERS = 4_194_304
@@ -43,7 +43,7 @@ class StepReward:
         self.network, self._ensemble, self._measure, self._solve = network, ensemble, measure or each_input, solve
         self._sizes, self._gain = (task.observation_size, task.action_size), gain / task.segment_steps
         self._describe = describe
-        width = sum(self._sizes) if describe is None else described(describe, task)
+        width = input_width(task, describe)
         self._input_mean, self._input_std = torch.zeros(width), torch.ones(width)
         self._shift, self._scale = torch.zeros(network.members), torch.ones(network.members)
         self._temperature, self._fits = 1.0, 0
@@ -267,18 +267,6 @@ def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     variance = sum((each[:, : len(piece)] @ piece)[0] for piece in squares)
     std = torch.as_tensor(variance).sqrt()
     return mean, torch.where(std > 1e-6, std, 1.0)
-
-
-def described(describe: Describe, task: ControlTask) -> int:
-    """How many features a function makes of a step of a task. Raises `ConfigError` where it makes none of it."""
-    observation, action = (np.zeros((1, size), np.float32) for size in (task.observation_size, task.action_size))
-    found = np.asarray(describe(observation, action))
-    if found.ndim != 2 or len(found) != 1 or not found.size or found.dtype.kind not in "fiub":
-        raise ConfigError(
-            f"hand-made features: expected (S, d) real numbers for {observation.shape} observations and {action.shape} "
-            f"actions, got {found.dtype} of shape {found.shape}"
-        )
-    return int(found.shape[1])
 
 
 def control(task: Task, kind: str) -> ControlTask:
