@@ -52,7 +52,9 @@ class LinearSettings(Settings):
         installed = feature_functions()
         if self.features not in installed:
             hint = suggest(self.features, [*OWN, *installed])
-            raise ConfigError(f"unknown reward.features {self.features!r}; {hint}")
+            raise ConfigError(
+                f"unknown reward.features {self.features!r}; {hint}; or install the package that brings them"
+            )
         function: Describe = installed[self.features].load()
         return function
 
