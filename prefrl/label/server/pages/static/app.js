@@ -61,7 +61,7 @@ function help() {
   helpDialog(app.settings);
 }
 
-/** Show the guideline; from then on this version counts as read. */
+/** Show the guideline; once it is closed, this version counts as read. */
 async function guideline(notice = "") {
   try {
     settings.set("guideline", await guidelineDialog({ notice }));
@@ -79,12 +79,12 @@ async function offerConsent() {
   offerGuideline();
 }
 
-/** A guideline that is new to this browser is put before the person, once. */
+/** A guideline that is new to this browser is put before the person, once, and after what must be agreed to. */
 let offered = "";
 function offerGuideline() {
-  const version = session.state.guideline;
+  const { guideline: version, consent: owed } = session.state;
   const read = settings.get("guideline");
-  const busy = location.pathname === "/admin" || view instanceof Consent || document.querySelector("dialog[open]");
+  const busy = !view || owed || location.pathname === "/admin" || document.querySelector("dialog[open]");
   if (!version || version === read || version === offered || busy) return;
   offered = version;
   guideline(read ? t("guide.changed") : t("guide.first"));

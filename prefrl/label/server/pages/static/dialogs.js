@@ -58,7 +58,7 @@ function keyRow(action) {
   return [el("dt", {}, keys), el("dd", { text: t(`action.${action}`) })];
 }
 
-/** The guideline as it stands; `notice` where it changed since it was last read. Resolves to its version. */
+/** The guideline as it stands; `notice` where it changed since it was last read. Its version, once it is closed. */
 export async function guidelineDialog({ notice = "" } = {}) {
   const { version, text } = await get("/api/guideline");
   const read = el("button", {
@@ -71,7 +71,7 @@ export async function guidelineDialog({ notice = "" } = {}) {
   const body = [notice ? el("p", { class: "notice", text: notice }) : null, guidelineBody({ version, text })];
   const dialog = openDialog(t("guide.title"), body, { testid: "guideline-dialog", wide: true, actions: [read] });
   read.addEventListener("click", () => dialog.close());
-  return version;
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(version)));
 }
 
 /** The guideline's text, drawn as Markdown, and its version. */
