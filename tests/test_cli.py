@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 from shell import Shell
+from text_models import classifier, gpt2
 
 from prefrl.components import TABLE, kinds
 from prefrl.console import interrupts
+from prefrl.envs.text import Reviews
 
 
 def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
@@ -61,7 +63,17 @@ def test_the_scores_of_texts_are_written_as_rewardbench_does(prefrl: Shell) -> N
     written = json.loads(Path("bench/eval-set-scores/reward.json").read_text())
     card = json.loads(Path("card.json").read_text())
     assert len(written["results"]) == card["accuracy"]["count"]
+    assert written["chat_template"] == "none"
     assert card["lengths"]["unit"] == "tokens"
+
+
+def test_rewardbench_is_told_which_reward_model_reads_by_a_chat_template(prefrl: Shell, toy_reviews: Reviews) -> None:
+    template = "{% for m in messages %}{{ m.role }}: {{ m.content }}{{ eos_token }}{% endfor %}"
+    classifier(toy_reviews, Path("chat"), gpt2().config, chat_template=template)
+    assert prefrl("label text/toy loop.labels=12 --out labels") == 0
+    assert prefrl("fit labels --out reward reward.checkpoint=chat reward.members=1") == 0
+    assert prefrl("evaluate --reward reward --data labels --rewardbench bench") == 0
+    assert json.loads(Path("bench/eval-set-scores/reward.json").read_text())["chat_template"] == "tokenizer"
 
 
 def test_the_three_uses_stand_alone_for_text(prefrl: Shell) -> None:
