@@ -74,6 +74,10 @@ class WebSettings(Settings):
     """What is asked, in one sentence; "Which clip is better?" where it is left out."""
     check_share: float = Field(0.05, ge=0, le=0.5)
     """The share of questions with a clear answer, to find out whether a person looks. Nothing is learned from them."""
+    check_warn: float = Field(0.8, ge=0, le=1)
+    """Admins are told of who answers fewer checks than this share as expected (the 95 % interval's upper end)."""
+    check_pause: float = Field(0.0, ge=0, le=1)
+    """Who answers fewer than this share as expected, by the same interval, is paused until an admin has them go on."""
     repeat_share: float = Field(0.05, ge=0, le=0.5)
     """The share of questions that are asked of the same person again, with the sides turned round."""
     minimum_watched: float = Field(0.0, ge=0, le=1)

@@ -132,14 +132,19 @@ class Access:
         live = [t for t in self._tokens.values() if t.name == name and t.use == "invite" and not t.revoked]
         return [_revoke(token) for token in live]
 
-    def change(self, name: str, state: State) -> list[Event]:
-        """Pause somebody, let them go on, or send them away for good. Raises `ValueError`."""
+    def change(self, name: str, state: State, why: str = "") -> list[Event]:
+        """Pause somebody, let them go on, or send them away for good. Raises `ValueError`.
+
+        `why` is kept where no admin did it.
+        """
         found = self._people.get(name)
         if found is None:
             raise KeyError(name)
         if found.state == "revoked" and state != "revoked":
             raise ValueError(f"{name!r} was revoked, which is for good: invite under another name")
-        return [] if found.state == state else [row(f"state:{uuid.uuid4().hex}", "state", "", name, {"state": state})]
+        if found.state == state:
+            return []
+        return [row(f"state:{uuid.uuid4().hex}", "state", "", name, {"state": state} | ({"why": why} if why else {}))]
 
     def note(self, events: list[Event]) -> None:
         """Follow events that were appended."""

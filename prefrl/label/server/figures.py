@@ -48,11 +48,11 @@ class Figures:
 class Dashboard:
     """The figures of one store. It remembers what it has read of the log, so that only what is new costs time.
 
-    `fps` is that of the clips, None for text. May be called from any thread.
+    `fps` is that of the clips, None for text; `check_warn` as in `tallies.concerns`. May be called from any thread.
     """
 
-    def __init__(self, fps: float | None = None, seed: int = 0) -> None:
-        self._ledger, self._seed = Ledger(fps), seed
+    def __init__(self, fps: float | None = None, check_warn: float = 0.8, seed: int = 0) -> None:
+        self._ledger, self._check_warn, self._seed = Ledger(fps), check_warn, seed
         self._sequence, self._agreed = 0, 0
         self._agreement: tuple[AgreementRow, dict[int, Measured]] | None = None
         self._seen: dict[str, str] = {}
@@ -122,7 +122,7 @@ class Dashboard:
                 **asdict(person),
                 **{name: interval(measured) for name, measured in others.items()},
             )
-            found.append(made.model_copy(update={"concerns": tallies.concerns(made)}))
+            found.append(made.model_copy(update={"concerns": tallies.concerns(made, self._check_warn)}))
         return found
 
 

@@ -37,6 +37,7 @@ from prefrl.types import Query
 
 if TYPE_CHECKING:
     from prefrl.label.server.figures import Dashboard
+    from prefrl.resampling import Measured
 
 T = TypeVar("T")
 
@@ -56,6 +57,10 @@ class Terms:
     fps: float = 0.0
     fixed: bool = False
     """No more questions will come: who has answered all is done."""
+    check_warn: float = 0.8
+    """Admins are told of who surely answers fewer check questions than this share as expected."""
+    check_pause: float = 0.0
+    """Who surely answers fewer than this share is paused, until an admin has them go on."""
     rate: float = 10.0
     """Requests a second that one person may make; three times as many at once."""
 
@@ -154,6 +159,8 @@ class Service:
 
     async def answer(self, name: str, sent: api.Answer) -> api.Receipt:
         taken = await self.write(lambda tx: self.intake.answer(tx, name, sent), self._taken)
+        if self.terms.check_pause and taken.given is not None and taken.given.purpose == "check":
+            await self._pause_unlooking(name)
         return api.Receipt(seq=taken.seq, duplicate=taken.duplicate)
 
     async def undo(self, name: str, sent: api.Undo) -> api.Undone:
@@ -223,7 +230,7 @@ class Service:
         """The figures for admins, made when the first one looks: a server is up in half the time without scipy."""
         from prefrl.label.server.figures import Dashboard
 
-        return Dashboard(self.terms.fps if self.terms.page.kind == "control" else None)
+        return Dashboard(self.terms.fps if self.terms.page.kind == "control" else None, self.terms.check_warn)
 
     @property
     def read_only(self) -> bool:
@@ -256,6 +263,22 @@ class Service:
             past = records.past(connection, name)
         if not self.desk.knows(name):
             self.desk.tell(name, past)
+
+    async def _pause_unlooking(self, name: str) -> None:
+        """Pause an annotator who surely fails too many check questions."""
+        who, least = self.access.person(name), self.terms.check_pause
+        if who is None or who.role != "annotator" or who.state != "active":
+            return
+        found = await run_in_threadpool(self._attention, name)
+        if found.value is not None and found.high is not None and found.high < least:
+            why = f"checks answered as expected: {found.value:.0%} of {found.count}, less than {least:.0%}"
+            await self.record(self.access.change(name, "paused", why))
+
+    def _attention(self, name: str) -> Measured:
+        from prefrl.label.server.attention import attention  # it needs scipy; see `dashboard`
+
+        with self.store.log.reading() as connection:
+            return attention(connection, name)
 
     def _history(self, name: str) -> list[api.Entry]:
         with self.store.log.reading() as connection:

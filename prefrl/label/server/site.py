@@ -155,6 +155,8 @@ def terms_of(labeler: WebLabeler) -> Terms:
         consent=settings.consent,
         fps=cast(ControlTask, task).fps if task.kind == "control" else 0.0,
         fixed=labeler.fixed and not settings.stay_open,
+        check_warn=settings.check_warn,
+        check_pause=settings.check_pause,
         rate=settings.requests_per_second,
     )
 

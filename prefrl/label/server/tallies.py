@@ -139,15 +139,18 @@ def throughput(at: Floats, now: float) -> tuple[Literal["minute", "hour"], list[
     return ("minute" if young else "hour"), list(zip(starts, counts.tolist(), strict=True))
 
 
-def concerns(row: AnnotatorRow) -> list[str]:
-    """What an admin should look at in one person's numbers, in words; empty where nothing is striking."""
+def concerns(row: AnnotatorRow, check_warn: float = 0.8) -> list[str]:
+    """What an admin should look at in one person's numbers, in words; empty where nothing is striking.
+
+    `check_warn` is the share of check questions that anybody who looks answers as expected.
+    """
     found = []
     if row.left.value is not None:
         p = position_test(round(row.left.value * row.left.count), row.left.count)
         if p is not None and p < 0.01:
             side = "left" if row.left.value > 0.5 else "right"
             found.append(f"prefers the {side} side: {row.left.value:.0%} left of {row.left.count}, p = {p:.2g}")
-    for name, low in (("checks", 0.8), ("repeats", 0.6)):
+    for name, low in (("checks", check_warn), ("repeats", 0.6)):
         rate: Interval = getattr(row, name)
         if rate.value is not None and rate.high is not None and rate.high < low:
             found.append(f"{name} answered as expected: {rate.value:.0%} of {rate.count}, less than {low:.0%}")
