@@ -168,12 +168,13 @@ class _Descent(Generic[C]):
         return flipped(problem.train, verdict.flip), problem.weight * verdict.keep
 
     def _step(self, loss: Tensor) -> None:
-        self.optimizer.zero_grad()
+        for parameter in self._all():
+            parameter.grad = None
         loss.backward()  # type: ignore[no-untyped-call]
         norm = _shorten([p.grad for p in self.parameters if p.grad is not None], self.fitting.max_grad_norm)
-        if not norm.isfinite():
+        if not math.isfinite(norm):
             raise FloatingPointError(
-                f"the gradient of the reward model's loss is {float(norm)}, and the loss {float(loss.detach())}: "
+                f"the gradient of the reward model's loss is {norm}, and the loss {float(loss.detach())}: "
                 "lower fitting.learning_rate"
             )
         self.optimizer.step()
@@ -192,13 +193,14 @@ class _Descent(Generic[C]):
         return [p.detach().clone() for p in self._all()]
 
 
-def _shorten(gradients: list[Tensor], most: float) -> Tensor:
+def _shorten(gradients: list[Tensor], most: float) -> float:
     """Scale gradients so that together they are no longer than `most`; returns how long they were.
 
     torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
     """
-    norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-    torch._foreach_mul_(gradients, (most / (norm + 1e-6)).clamp(max=1.0))
+    norm = float(torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients))))
+    if norm > most:
+        torch._foreach_mul_(gradients, most / norm)
     return norm
 
 

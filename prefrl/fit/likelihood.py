@@ -86,30 +86,32 @@ class Likelihood:
         found = scores[:, rows.items]
         if not rows.pairs:
             found = found.masked_fill(~rows.present, -torch.inf)
-        error = self._error(labeler[rows.judgement], self._outcomes(rows))
+        error = self._error(rows, labeler)
         if self._ties == "half":
             return losses.choice(found, rows.target, error)
         of_ties = losses.davidson if self._ties == "davidson" else losses.rao_kupper
         return of_ties(found, rows.target, rows.tied, self.tie, error)
 
-    def _outcomes(self, rows: Choices) -> Tensor:
-        """(S,) how many answers a choice could get: one for each candidate, and with ties for each set of them."""
+    def _outcomes(self, rows: Choices | Ratings) -> Tensor:
+        """(rows,) how many answers there could be: one for each level, or each candidate, and with ties each set."""
+        if isinstance(rows, Ratings):
+            return torch.full_like(rows.level, self.thresholds().shape[1] + 1)
         candidates = rows.present.sum(1)
         return candidates if self._ties == "half" else 2**candidates - 1
 
     def _ratings(self, rows: Ratings, scores: Tensor, labeler: Tensor) -> Tensor:
-        levels = torch.tensor(self.thresholds().shape[1] + 1)
-        error = self._error(labeler[rows.judgement], levels)
+        error = self._error(rows, labeler)
         return losses.rating(scores[:, rows.items], rows.level, self.thresholds(), error)
 
-    def _error(self, labeler: Tensor, outcomes: Tensor) -> Tensor | float:
-        """(E, rows, 1) how often each answer is wrong; a share of blind answers hits the right one now and then."""
+    def _error(self, rows: Choices | Ratings, labeler: Tensor) -> Tensor | float:
+        """(E, rows) how often each answer is wrong; a share of blind answers hits the right one now and then."""
         if self.errors.requires_grad:
-            return self.errors.sigmoid()[:, labeler]
+            return self.errors.sigmoid()[:, labeler[rows.judgement]]
         if self._error_rate == 0.0:
             return 0.0
+        outcomes = self._outcomes(rows)
         blind: Tensor = self._error_rate * (outcomes - 1) / outcomes
-        return blind.expand(1, *labeler.shape)
+        return blind[None]
 
 
 def weights(terms: Terms, of_judgement: Tensor) -> Tensor:

@@ -21,6 +21,8 @@ def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:
     is trained on, or makes one that holds more than half of all: such a component is always trained on. Nothing is
     held out where that would leave nothing to train on.
     """
+    if not share:
+        return np.zeros(len(judged), bool)
     component = _components(judged)
     _, first, sizes = np.unique(component, return_index=True, return_counts=True)
     small = first[2 * sizes <= len(judged)]

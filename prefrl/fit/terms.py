@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
-from typing import Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -218,15 +219,20 @@ def _stacked(rows: Sequence[tuple[list[int], Stage, int]], width: int) -> Choice
     """(candidates, stage, judgement) -> tensors, each row filled up to `width`."""
     items = [[*at, *[at[0]] * (width - len(at))] for at, _, _ in rows]
     target = [[*stage.target, *[0.0] * (width - len(at))] for at, stage, _ in rows]
-    sizes = torch.tensor([len(at) for at, _, _ in rows], dtype=torch.int64)
+    sizes = _tensor([len(at) for at, _, _ in rows], np.int64)
     return Choices(
-        items=torch.tensor(items, dtype=torch.int64).view(-1, width),
+        items=_tensor(items, np.int64).view(-1, width),
         present=torch.arange(width) < sizes[:, None],
-        target=torch.tensor(target, dtype=torch.float32).view(-1, width),
-        tied=torch.tensor([stage.tied for _, stage, _ in rows], dtype=torch.bool),
-        weight=torch.tensor([stage.weight for _, stage, _ in rows], dtype=torch.float32),
-        judgement=torch.tensor([number for _, _, number in rows], dtype=torch.int64),
+        target=_tensor(target, np.float32).view(-1, width),
+        tied=_tensor([stage.tied for _, stage, _ in rows], np.bool_),
+        weight=_tensor([stage.weight for _, stage, _ in rows], np.float32),
+        judgement=_tensor([number for _, _, number in rows], np.int64),
     )
+
+
+def _tensor(values: Sequence[Any], dtype: Any) -> Tensor:
+    """By way of NumPy, which reads lists several times faster than torch."""
+    return torch.from_numpy(np.array(values, dtype))
 
 
 def _ratings(judged: Sequence[Judged[C]], index: dict[str, int]) -> Ratings:
