@@ -73,11 +73,12 @@ def writer(folder: Path, url: str | None) -> sql.Engine:
 
 
 def reader(folder: Path, url: str | None) -> sql.Engine:
-    """An engine whose connections cannot write."""
+    """An engine whose connections cannot write; each transaction sees one state of the store throughout."""
     if url is not None:
-        engine = _engine(folder, url, execution_options={"postgresql_readonly": True})
-        if engine.dialect.name == "sqlite":
-            _set_up(engine, writes=False, journal=None)
+        engine = _engine(folder, url, pool_pre_ping=True)  # a server may have been restarted
+        if engine.dialect.name != "sqlite":
+            return engine.execution_options(postgresql_readonly=True, isolation_level="REPEATABLE READ")
+        _set_up(engine, writes=False, journal=None)
         return engine
     engine = _sqlite(folder, "ro", pool_size=4, max_overflow=16)
     _set_up(engine, writes=False, journal=None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,8 @@ from stores import derived, fill, responses
 from prefrl.log import DamagedStore, StoreError
 from prefrl.maintenance import backup, repair_derived, verify_store
 from prefrl.store import Store
-from prefrl.types import Response
+from prefrl.tables import event
+from prefrl.types import Comparison, Response
 
 
 @pytest.fixture
@@ -34,6 +37,51 @@ def test_it_holds_the_same_as_sqlite(folder: Path, tmp_path: Path) -> None:
         assert [e["body"] for e in store.events()] == [e["body"] for e in other.events()]
         assert derived(folder) == derived(tmp_path / "sqlite")
     assert not (folder / "store.db").exists()
+
+
+def test_readers_see_one_state_while_somebody_writes(folder: Path) -> None:
+    with Store[Response](folder) as store, store.log.reading() as connection:
+        store.ask(responses(2))
+        before = connection.scalar(sql.select(sql.func.count()).select_from(event))
+        store.ask(responses(4))
+        assert connection.scalar(sql.select(sql.func.count()).select_from(event)) == before > 0
+
+
+def test_a_store_is_opened_and_verified_while_somebody_writes(folder: Path) -> None:
+    with Store[Response](folder) as store:
+        fill(store)
+        stop = threading.Event()
+        writing = threading.Thread(target=_write_until, args=(store, stop))
+        writing.start()
+        try:
+            for _ in range(15):
+                with Store[Response](folder, write=False) as reader:
+                    assert reader.counts()["asked"] > 0
+                assert verify_store(folder).ok
+        finally:
+            stop.set()
+            writing.join()
+
+
+def _write_until(store: Store[Response], stop: threading.Event) -> None:
+    queries = responses(12)
+    for number in count():
+        store.answer([Comparison(queries[number % 12].id, float(number % 2), f"person {number}")])
+        if stop.is_set():
+            return
+
+
+def test_reading_goes_on_after_the_server_dropped_its_connections(folder: Path, postgres_url: str) -> None:
+    with Store[Response](folder) as store:
+        store.ask(responses(2))
+    with Store[Response](folder, write=False) as reader:
+        asked = reader.counts()["asked"]
+        engine = sql.create_engine(postgres_url)
+        with engine.begin() as connection:
+            others = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
+            connection.exec_driver_sql(others + " AND backend_type = 'client backend'")
+        engine.dispose()
+        assert reader.counts()["asked"] == asked
 
 
 def test_the_database_refuses_changes_to_the_log(folder: Path, postgres_url: str) -> None:
