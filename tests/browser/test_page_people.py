@@ -27,6 +27,17 @@ def test_who_has_no_link_is_told_how_to_get_one(text_house: House, visit: Visit)
     expect(nobody.test("welcome")).to_contain_text("Open the link you were sent")
 
 
+def test_a_link_is_kept_while_the_server_is_too_busy_to_look_at_it(text_house: House, visit: Visit) -> None:
+    ann = visit(text_house.origin, wait=False)
+    ann.allowed += ["401", "429"]
+    busy = {"status": 429, "headers": {"retry-after": "1"}, "json": {"error": "too many requests"}}
+    ann.page.route("**/api/session", lambda route: route.fulfill(**busy), times=1)
+    ann.page.goto(text_house.link("ann"))
+    expect(ann.test("welcome")).to_contain_text("Your link is kept")
+    ann.test("retry").click()
+    ann.question()
+
+
 def test_an_admin_invites_somebody_who_labels_in_another_browser(text_house: House, visit: Visit) -> None:
     me = visit(text_house.admin)
     me.go("/admin")
@@ -93,8 +104,7 @@ def test_a_new_guideline_is_put_before_people_at_work(text_house: House, visit: 
     ann.page.reload()
     ann.question()
     assert ann.test("guideline-dialog").count() == 0
-    for _ in range(8):
-        ann.press("1")
+    ann.press("1")  # a question that was fetched before the guideline changed
     ann.saved()
     assert text_house.about()[-1]["guideline"] == text_house.service.guideline.version
 
@@ -148,10 +158,14 @@ def test_an_export_is_downloaded(text_house: House, visit: Visit) -> None:
     ann, me = visit(text_house.link("ann")), visit(text_house.admin)
     me.go("/admin")
     ann.press("1")
+    ann.press("0")
     ann.saved()
     with me.page.expect_download() as download:
         me.test("export-preferences").click()
+    assert download.value.suggested_filename == "preferences.jsonl"
     assert len(download.value.path().read_text().splitlines()) == 1
+    expect(me.test("toast").first).to_contain_text("preferences.jsonl: 1 written. Left out: ")
+    expect(me.test("toast").first).to_contain_text("1 × tie")
 
 
 def test_signing_out_ends_the_session(text_house: House, visit: Visit) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from pathlib import Path
@@ -12,6 +13,7 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
+from prefrl.label.exports.given import Exported
 from prefrl.label.server import api
 from prefrl.label.server.access import Person
 from prefrl.label.server.overview import Health, Link, Overview
@@ -40,13 +42,14 @@ def _add_overview(router: APIRouter) -> None:
 
     @router.get("/api/admin/export/{name}", responses=errors(401, 404), response_class=FileResponse)
     async def export(name: str, who: Admin, served: Served) -> FileResponse:
-        """Judgements as a file."""
+        """Judgements as a file; the header Prefrl-About says, as JSON, what it could not hold."""
         known = EXPORTS[served.terms.page.kind]
         if name not in known:
             raise Refused(404, f"there is no such export: choose from {', '.join(known)}")
-        path = await run_in_threadpool(_export, served, name)
-        done = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
-        return FileResponse(path, filename=path.name, background=done)
+        path, done = await run_in_threadpool(_export, served, name)
+        about = {"file": path.name, "written": done.written, "left_out": done.dropped, "notes": done.notes}
+        clear = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
+        return FileResponse(path, filename=path.name, background=clear, headers={"prefrl-about": json.dumps(about)})
 
 
 def _add_people(router: APIRouter) -> None:
@@ -123,7 +126,7 @@ def _overview(served: Service) -> Overview:
     )
 
 
-def _export(served: Service, name: str) -> Path:
+def _export(served: Service, name: str) -> tuple[Path, Exported]:
     """Write an export into a temporary folder of its own, from a store that is only read; folders are zipped."""
     from prefrl.label.exchange import export
 
@@ -131,8 +134,8 @@ def _export(served: Service, name: str) -> Path:
     path = folder / f"{name}{EXPORTS[served.terms.page.kind][name]}"
     try:
         with Store[Any](served.store.folder, write=False) as store:
-            export(store, path, name)
-        return Path(shutil.make_archive(str(path), "zip", path)) if path.is_dir() else path
+            done = export(store, path, name)
+        return Path(shutil.make_archive(str(path), "zip", path)) if path.is_dir() else path, done
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -81,6 +81,8 @@ class Answer(Body):
     timings: Timings = Timings()
     input: Literal["key", "mouse", "touch"] = "key"
     ui_version: str = Field("", max_length=40)
+    guideline: str = Field("", pattern="^[0-9a-f]{0,64}$")
+    """Version of the guideline that this person has read last; "" where it is that of the assignment."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Answer:

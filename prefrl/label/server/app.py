@@ -92,10 +92,13 @@ def _add_session(app: FastAPI) -> None:
     @app.post("/api/session", responses=errors(401, 403, 429, 503, 507))
     async def login(sent: api.Login, request: Request, response: Response, served: Served) -> api.Me:
         """Exchange an invite for a session."""
-        served.logins.take(request.client.host if request.client else "")
+        address = request.client.host if request.client else ""
+        served.logins.take(address)
         found = served.access.who(sent.token, "invite")
         if found is None:
             raise Refused(401, "this link does not work, or no longer: ask for a new one")
+        served.logins.give_back(address)  # guesses are counted: many people may share an address
+        served.requests.take(found.name)
         if found.role == "trainer":
             raise Refused(403, "this link is for a program that reads labels, not for a browser")
         token, events = served.access.session(found.name)

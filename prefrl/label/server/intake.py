@@ -149,7 +149,7 @@ class Intake:
         """How an answer came about, kept beside it."""
         kept = sent.model_dump(exclude={"submission_id", "assignment_id"})
         ids = {"submission": sent.submission_id, "digest": digest, "assignment": given.id}
-        return kept | ids | {"guideline": given.guideline}
+        return kept | ids | {"guideline": sent.guideline or given.guideline}
 
     def _file_repeat(self, tx: Transaction, given: Given, answer: Answer, about: dict[str, Any], again: bool) -> int:
         """An answer that nothing is learned from; the first one stays where it was."""

@@ -196,6 +196,11 @@ class Buckets:
         if level < 1:
             raise Refused(429, "too many requests: slow down a little", retry_after=(1 - level) / self.rate)
 
+    def give_back(self, key: str) -> None:
+        """What was taken last was no trespass after all."""
+        level, since = self._levels[key]
+        self._levels[key] = min(self.burst, level + 1), since
+
 
 class _Answer:
     """A response on its way out."""

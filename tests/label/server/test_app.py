@@ -336,6 +336,12 @@ def test_a_new_guideline_is_a_new_version_and_answers_say_which(service: Service
     assert ann.get("/api/guideline").json() == made
     assert ann.get("/api/state").json()["guideline"] == made["version"]
     assert [card["guideline"] for card in ask_for(ann, 2)] == [old["guideline"], made["version"]]
+    ann.post("/api/answers", json=answering(old["assignment_id"], guideline=made["version"]))
+    ann.post("/api/answers", json=answering(ask_for(ann)[0]["assignment_id"]))
+    answers = [event["body"]["about"] for event in service.store.events() if event["kind"] == "comparison"]
+    assert [about["guideline"] for about in answers] == [made["version"]] * 2, "as the page says, else as it was given"
+    stale = answering(ask_for(ann)[0]["assignment_id"], guideline="not a version")
+    assert ann.post("/api/answers", json=stale).status_code == 422
 
 
 def test_a_problem_can_be_reported_once(service: Service, ann: TestClient) -> None:
@@ -426,6 +432,9 @@ def test_an_admin_sees_the_project_and_takes_it_along(service: Service, ann: Tes
         assert taken.status_code == 200, name
         assert taken.headers["content-disposition"].startswith(f'attachment; filename="{name}')
         assert (taken.content[:2] == b"PK") == (name in ("bundle", "minari"))
+        about = json.loads(taken.headers["prefrl-about"])
+        assert about["file"] in taken.headers["content-disposition"]
+        assert (about["written"], set(about)) == (1, {"file", "written", "left_out", "notes"})
     assert boss.get("/api/admin/export/nothing").status_code == 404
 
 

@@ -340,6 +340,14 @@ def test_links_cannot_be_tried_out_in_a_row(service: Service) -> None:
     assert statuses == [401] * 20 + [429] * 10
 
 
+def test_many_people_come_in_from_one_address(service: Service) -> None:
+    tokens = [invite(service, f"person {n}") for n in range(30)]
+    plenty, service.logins = service.logins, Buckets(1, 20, service.clock)
+    statuses = [browser(service).post("/api/session", json={"token": token}).status_code for token in tokens]
+    service.logins = plenty
+    assert statuses == [200] * 30
+
+
 def test_what_went_wrong_inside_is_neither_told_nor_logged_with_what_was_sent(
     ann: TestClient, service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

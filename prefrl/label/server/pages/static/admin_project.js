@@ -1,6 +1,6 @@
 /** What an admin can change while people label, and take away. */
 
-import { Failed, post } from "./api.js";
+import { Failed, getFile, post } from "./api.js";
 import { guidelineBody } from "./dialogs.js";
 import { el, isolate, put } from "./dom.js";
 import { t } from "./strings.js";
@@ -82,16 +82,33 @@ export function exportsView(names) {
   return el(
     "div",
     { class: "export-links" },
-    names.map((name) =>
-      el("a", {
-        href: `/api/admin/export/${encodeURIComponent(name)}`,
-        download: true,
-        class: "button secondary",
-        testid: `export-${name}`,
-        text: name,
-      }),
-    ),
+    names.map((name) => {
+      const button = el("button", { type: "button", class: "secondary", testid: `export-${name}`, text: name });
+      button.addEventListener("click", async () => {
+        button.disabled = true;
+        await take(name);
+        button.disabled = false;
+      });
+      return button;
+    }),
   );
+}
+
+/** Save an export, and say what it could not hold. */
+async function take(name) {
+  try {
+    const { blob, about } = await getFile(`/api/admin/export/${encodeURIComponent(name)}`);
+    const address = URL.createObjectURL(blob);
+    el("a", { href: address, download: about.file }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 60_000);
+    const left = Object.entries(about.left_out).map(([what, count]) => `${count} × ${what}`);
+    const values = { name: about.file, written: about.written, left: left.join("; ") };
+    const text = left.length ? t("exports.left", values) : t("exports.saved", values);
+    toast([text, ...about.notes].join(" "), { sign: left.length ? "warning" : "check", seconds: left.length ? 30 : 8 });
+  } catch (error) {
+    if (!(error instanceof Failed)) throw error;
+    toast(error.message, { kind: "bad", sign: "warning" });
+  }
 }
 
 /** What people reported, newest first. */

@@ -35,6 +35,15 @@ export async function call(method, path, body) {
 export const get = (path) => call("GET", path);
 export const post = (path, body) => call("POST", path, body ?? {});
 
+/** Get a file: {blob, about}, with what the server says of it. Raises `Failed`. There is no limit on the time. */
+export async function getFile(path) {
+  const response = await fetch(path, request("GET")).catch(() => {
+    throw new Failed(0, t("error.offline"));
+  });
+  if (!response.ok) await read(response);
+  return { blob: await response.blob(), about: JSON.parse(response.headers.get("Prefrl-About")) };
+}
+
 function request(method, body, signal) {
   const settings = { method, signal, credentials: "same-origin", cache: "no-cache", redirect: "error" };
   if (body === undefined) return settings;

@@ -9,6 +9,7 @@ import { cap, listen } from "./keys.js";
 import { message } from "./messages.js";
 import { Player } from "./player.js";
 import { Question } from "./question.js";
+import { settings } from "./settings.js";
 import { t } from "./strings.js";
 import { toast } from "./toast.js";
 import { inWords } from "./verdict.js";
@@ -165,6 +166,7 @@ export class Labelling {
       ...given,
       ...this.#draft,
       ui_version: session.me.page.ui_version,
+      guideline: settings.get("guideline"),
     };
     outbox.add("/api/answers", body);
     this.#given = [...this.#given.slice(-59), { assignment, body }];

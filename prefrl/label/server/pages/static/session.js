@@ -13,11 +13,19 @@ export class Session extends EventTarget {
   #timer = 0;
   #seq = 0;
   #misses = 0;
+  /** The link's, until the server has said yes or no to it. */
+  #token = "";
 
-  /** Sign in with the link's token if there is one, and find out who this is. Raises `Failed`. */
+  /** Sign in with the link's token if there is one, and find out who this is. Raises `Failed`; may be tried again. */
   async open() {
-    const token = takeToken();
-    this.me = token ? await enter(token) : await get("/api/me");
+    this.#token = takeToken() || this.#token;
+    try {
+      this.me = this.#token ? await enter(this.#token) : await get("/api/me");
+    } catch (error) {
+      if (!error.passing) this.#token = "";
+      throw error;
+    }
+    this.#token = "";
     this.state = {
       seq: 0,
       progress: this.me.progress,

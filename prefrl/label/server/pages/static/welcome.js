@@ -7,27 +7,27 @@ import { card } from "./messages.js";
 import { t } from "./strings.js";
 import { toast } from "./toast.js";
 
-/** Who has no link, or one that is no longer good, reads here what to do. */
+/** Who has no link, or one that is no longer good, reads here what to do; and who cannot come in just now. */
 export function welcome(root, error, retry, unsent = 0) {
-  const refused = error.status === 401 || error.status === 403;
-  const again = el("button", { type: "button", class: "primary", text: t("welcome.retry"), on: { click: retry } });
+  const { refused, sign, title, text } = reason(error.status);
+  const again = el("button", { type: "button", class: "primary", testid: "retry", text: t("welcome.retry") });
+  again.addEventListener("click", retry);
   const content = [
-    el("p", { text: refused ? t("welcome.link") : t("welcome.unreachable") }),
-    refused ? el("p", { class: "detail", text: t("welcome.how") }) : el("p", { class: "detail", text: error.message }),
+    el("p", { text }),
+    el("p", { class: "detail", text: refused ? t("welcome.how") : error.message }),
     unsent
       ? el("p", { class: "notice", text: t(unsent === 1 ? "welcome.unsent.one" : "welcome.unsent", { count: unsent }) })
       : null,
     refused ? null : again,
   ];
-  const sign = refused ? "book" : "cloudOff";
-  put(
-    root,
-    el(
-      "main",
-      { class: "welcome", id: "main", testid: "welcome" },
-      card(sign, refused ? t("welcome.title") : t("welcome.unreachable.title"), content),
-    ),
-  );
+  put(root, el("main", { class: "welcome", id: "main", testid: "welcome" }, card(sign, title, content)));
+}
+
+function reason(status) {
+  if (status === 401 || status === 403)
+    return { refused: true, sign: "book", title: t("welcome.title"), text: t("welcome.link") };
+  if (status === 429) return { sign: "pause", title: t("welcome.busy.title"), text: t("welcome.busy") };
+  return { sign: "cloudOff", title: t("welcome.unreachable.title"), text: t("welcome.unreachable") };
 }
 
 /** The guideline as a page. */
