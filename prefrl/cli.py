@@ -137,8 +137,10 @@ def fit(
     settings = _load(stages.config_of(source, config), overrides)
     fitted, notes = stages.fit_reward(settings, source, out, Which.of(labelers, split))
     console.print(metrics_table(f"reward model in {out}", fitted.metrics))
-    count = fitted.metrics["held_out"]
-    few = f"only {count:.0f} comparisons were held out: their accuracy says little" if count else "nothing was held out"
+    count = len(fitted.predicted)
+    few = f"only {count} comparisons were held out: their accuracy says little"
+    if not fitted.metrics["held_out"]:
+        few = "nothing was held out"
     for note in [*notes, *([few] if count < FEW else [])]:
         say(note, "yellow")
 

@@ -14,7 +14,8 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
-from prefrl.fit.settings import FittingSettings
+from prefrl.fit.descent import trainable
+from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.seeding import streams
 from prefrl.store import Store
@@ -91,10 +92,12 @@ class Config(Settings):
         rng = streams(self.seed, 0).build
         parts: Any = self  # the settings classes are known by kind only
         task = parts.task.build()
+        learner, reward = parts.learner.build(task, rng), parts.reward.build(task, rng)
+        check_settings(self.fitting, not trainable(reward), task.kind, parts.select.candidates)
         return Loop(
             task=task,
-            learner=parts.learner.build(task, rng),
-            reward=parts.reward.build(task, rng),
+            learner=learner,
+            reward=reward,
             labeler=parts.labeler.build(task),
             selector=parts.select.build(),
             store=store,

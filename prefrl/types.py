@@ -152,8 +152,8 @@ class Ranking:
 
     def __post_init__(self) -> None:
         _check_weight(self.weight)
-        if len(self.ranks) < 2 or min(self.ranks) < 0:
-            raise ValueError(f"a ranking needs a rank >= 0 for each of at least 2 candidates, got {self.ranks}")
+        if len(self.ranks) < 2 or not all(_is_count(rank) for rank in self.ranks):
+            raise ValueError(f"a ranking needs a whole rank >= 0 for each of at least 2 candidates, got {self.ranks}")
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Choice:
 
     def __post_init__(self) -> None:
         _check_weight(self.weight)
-        if self.best < 0:
+        if not _is_count(self.best):
             raise ValueError(f"the best candidate is counted from 0, got {self.best}")
 
 
@@ -188,8 +188,11 @@ class Rating:
 
     def __post_init__(self) -> None:
         _check_weight(self.weight)
-        if self.scale < 2 or not self.levels or not all(0 <= level < self.scale for level in self.levels):
-            raise ValueError(f"a rating needs levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}")
+        right = all(_is_count(level) and level < self.scale for level in self.levels)
+        if not (_is_count(self.scale) and self.scale >= 2 and self.levels and right):
+            raise ValueError(
+                f"a rating needs whole levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}"
+            )
 
 
 def person(labeler: str) -> str:
@@ -220,6 +223,8 @@ class Judged(Generic[C]):
     judgement: Judgement
 
     def __post_init__(self) -> None:
+        if self.judgement.query != self.query.id:
+            raise ValueError(f"query {self.query.id[:12]} got a judgement of query {self.judgement.query[:12]}")
         check_fits(self.judgement, len(self.query.candidates))
 
 
@@ -290,6 +295,11 @@ def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
         digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def _is_count(value: object) -> bool:
+    """Whether it is a whole number >= 0; NumPy's integers are, floats and booleans are not."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
 
 
 def _check_weight(weight: float) -> None:

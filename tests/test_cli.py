@@ -56,6 +56,14 @@ def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgement
     assert prefrl("evaluate") == 2
 
 
+def test_a_fit_says_how_little_was_held_out(prefrl: Shell) -> None:
+    assert prefrl("label control/toy loop.labels=40 seed=5 select.candidates=3 --out labels") == 0
+    assert prefrl("fit labels --out reward fitting.epochs=1") == 0
+    assert int(re.findall(r"only (\d+) comparisons were held out", prefrl.out)[0]) % 3 == 0  # three to a ranking
+    assert prefrl("fit labels --out alone fitting.epochs=1 fitting.held_out=0") == 0
+    assert "nothing was held out" in prefrl.out
+
+
 def test_the_scores_of_texts_are_written_as_rewardbench_does(prefrl: Shell) -> None:
     assert prefrl("label text/toy loop.labels=12 --out labels") == 0
     assert prefrl("fit labels --out reward") == 0

@@ -6,6 +6,7 @@ import yaml
 from prefrl import Config
 from prefrl.components import ConfigError, settings_class
 from prefrl.config import presets
+from prefrl.rundir import Run
 
 TOY = "control/toy"
 
@@ -43,6 +44,30 @@ def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:
 def test_the_order_of_overrides_does_not_matter() -> None:
     words = ["select.candidates=3", "select.kind=disagreement"]
     assert Config.load(TOY, words) == Config.load(TOY, words[::-1])
+
+
+@pytest.mark.parametrize(
+    ("preset", "overrides", "message"),
+    [
+        (TOY, "fitting.denoise=flip fitting.error_rate=0.1", "denoise=flip: with error_rate"),
+        (TOY, "fitting.denoise=flip fitting.reliability=learned", "denoise=flip: with error_rate"),
+        (TOY, "reward.kind=linear fitting.crop=0.2", "fitting.crop: this reward is solved for"),
+        (TOY, "fitting.ties=rao_kupper select.candidates=3", "knows pairs only, and select.candidates is 3"),
+        ("text/toy", "fitting.crop=0.2", "only segments can be cropped"),
+    ],
+)
+def test_what_a_fit_would_refuse_is_refused_before_anybody_is_asked(
+    tmp_path: Path, preset: str, overrides: str, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Run(Config.load(preset, overrides.split()), tmp_path / "run")
+    with Run(Config.load(preset), tmp_path / "run") as run:  # nothing has happened: the folder is still free
+        assert run.store.sequence == 0
+
+
+def test_pairs_of_rankings_know_ties_of_two(tmp_path: Path) -> None:
+    words = ["fitting.ties=rao_kupper", "select.candidates=3", "fitting.rankings=pairs"]
+    Run(Config.load(TOY, words), tmp_path / "run").close()
 
 
 def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:

@@ -7,6 +7,7 @@ from prefrl.types import (
     Answer,
     Choice,
     Comparison,
+    Judged,
     Query,
     Ranking,
     Rating,
@@ -66,6 +67,12 @@ def test_a_segment_with_unequal_lengths_is_refused() -> None:
         Segment(np.zeros((3, 1)), np.zeros((2, 1)), "e", 0)
 
 
+def test_a_judgement_of_another_query_is_refused() -> None:
+    one, other = (Query((response("a"), response(text))) for text in ("b", "c"))
+    with pytest.raises(ValueError, match=f"query {one.id[:12]} got a judgement of query {other.id[:12]}"):
+        Judged(one, Comparison(other.id, 1.0))
+
+
 def test_gold_is_only_there_where_it_was_attached() -> None:
     assert gold_score(response("a", gold=0.5)) == 0.5
     with pytest.raises(ValueError, match="carries no gold"):
@@ -104,6 +111,10 @@ def test_an_answer_fits_queries_of_its_own_size_only(answer: Answer, sizes: set[
         lambda: Rating("q", (), 5),
         lambda: Comparison("q", 1.0, weight=0.0),
         lambda: Ranking("q", (0, 1), weight=float("nan")),
+        lambda: Ranking("q", (0, float("nan"))),  # type: ignore[arg-type]
+        lambda: Ranking("q", (0, 1.5)),  # type: ignore[arg-type]
+        lambda: Rating("q", (1.9, 3.2), 5),  # type: ignore[arg-type]
+        lambda: Choice("q", 0.5),  # type: ignore[arg-type]
     ],
 )
 def test_judgements_that_say_nothing_are_refused(make: Callable[[], Answer]) -> None:

@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.components import ConfigError
 from prefrl.fit import semi
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
 from prefrl.fit.losses import weighted_mean
 from prefrl.fit.noise import Discriminator, flipped
-from prefrl.fit.settings import FittingSettings
+from prefrl.fit.settings import FittingSettings, check_solved
 from prefrl.fit.terms import Terms
 from prefrl.protocols import RewardModel
 from prefrl.seeding import draw_seed
@@ -92,29 +91,10 @@ class Problem(Generic[C]):
 def optimise(problem: Problem[C], rng: np.random.Generator) -> int:
     """Descend; returns the epochs run. A reward without parameters is solved for when it settles: 0 epochs."""
     if trainable(problem.reward):
-        _check_flips(problem.fitting)
         return _Descent(problem, rng).run()
-    _check_solved(problem.fitting)
+    check_solved(problem.fitting)
     _alternate(problem)
     return 0
-
-
-def _check_flips(fitting: FittingSettings) -> None:
-    """Raises `ConfigError` where no label could ever seem improbable enough to be turned round."""
-    if fitting.denoise == "flip" and (fitting.error_rate > 0 or fitting.reliability == "learned"):
-        raise ConfigError(
-            "fitting.denoise=flip: with error_rate or reliability=learned no label is improbable enough to be turned "
-            "round; set error_rate=0 and reliability=alike, or denoise=filter"
-        )
-
-
-def _check_solved(fitting: FittingSettings) -> None:
-    """Raises `ConfigError` for settings that change what is fitted from epoch to epoch, or from step to step."""
-    off = {"denoise": "off", "pseudo_labels": 0.0, "crop": 0.0}
-    if given := [f"fitting.{name}" for name, value in off.items() if getattr(fitting, name) != value]:
-        raise ConfigError(
-            f"{', '.join(given)}: this reward is solved for, not descended; leave them out, or use another reward.kind"
-        )
 
 
 class _Descent(Generic[C]):
@@ -253,9 +233,12 @@ def all_scores(reward: RewardModel[C], stacked: Mapping[str, Tensor], chunk: int
 
 @torch.no_grad()
 def ensemble_losses(problem: Problem[C], part: Terms, scores: Tensor | None = None) -> Tensor:
-    """(S + R,) -log of the members' mean likelihood of each term."""
-    found = all_scores(problem.reward, problem.stacked) if scores is None else scores
-    losses = problem.likelihood.losses(part, found)
+    """(S + R,) -log of the members' mean likelihood of each term; only candidates that it mentions are scored."""
+    if scores is None:
+        needed, here = torch.unique(part.candidates(), return_inverse=True)
+        stacked = {name: x.index_select(0, needed) for name, x in problem.stacked.items()}
+        part, scores = part.over(here), all_scores(problem.reward, stacked)
+    losses = problem.likelihood.losses(part, scores)
     return math.log(len(losses)) - (-losses).logsumexp(0)
 
 

@@ -12,6 +12,8 @@ from prefrl.components import ConfigError
 from prefrl.fit.losses import choice
 from prefrl.types import C
 
+NO_CROP = "fitting.crop: only segments can be cropped; set it to 0 for text"
+
 
 def pairs(candidates: Sequence[C], first: int, count: int, order: torch.Generator) -> Tensor:
     """(count, 2) random pairs of candidates of one context, counted from `first`; fewer where there are none.
@@ -51,7 +53,7 @@ def crop(stacked: Mapping[str, Tensor], share: float, order: torch.Generator) ->
     `ConfigError` for a reward model that does not stack steps.
     """
     if "inputs" not in stacked:
-        raise ConfigError("fitting.crop: only segments can be cropped; set it to 0 for text")
+        raise ConfigError(NO_CROP)
     count, steps = stacked["inputs"].shape[:2]
     shortest = max(1, round(steps * (1 - share)))
     length = int(torch.randint(shortest, steps + 1, (), generator=order))

@@ -6,8 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
 from prefrl.fit.likelihood import Reliability
+from prefrl.fit.semi import NO_CROP
 from prefrl.fit.terms import Rankings, Ties
 
 
@@ -56,3 +57,38 @@ class FittingSettings(Settings):
             name = "patience" if self.patience else "weight_decay=adaptive"
             raise ValueError(f"{name} needs held-out judgements, and held_out is 0; set held_out=0.15, say")
         return self
+
+    @model_validator(mode="after")
+    def _flips(self) -> Self:
+        """A label is turned round where it is all but impossible, which nothing is where errors are expected."""
+        if self.denoise == "flip" and (self.error_rate > 0 or self.reliability == "learned"):
+            raise ValueError(
+                "denoise=flip: with error_rate or reliability=learned no label is improbable enough to be turned "
+                "round; set error_rate=0 and reliability=alike, or denoise=filter"
+            )
+        return self
+
+
+def check_settings(fitting: FittingSettings, solved: bool, kind: str, candidates: int) -> None:
+    """Raise `ConfigError` for what a fit would refuse, before anybody is asked.
+
+    `solved`: the reward model has nothing to descend; `candidates`: how many there are in a query.
+    """
+    if solved:
+        check_solved(fitting)
+    if fitting.crop and kind == "text":
+        raise ConfigError(NO_CROP)
+    if fitting.ties == "rao_kupper" and fitting.rankings != "pairs" and candidates > 2:
+        raise ConfigError(
+            f"fitting.ties=rao_kupper knows pairs only, and select.candidates is {candidates}: set ties=davidson, or "
+            "rankings=pairs"
+        )
+
+
+def check_solved(fitting: FittingSettings) -> None:
+    """Raise `ConfigError` for settings that change what is fitted from epoch to epoch, or from step to step."""
+    off = {"denoise": "off", "pseudo_labels": 0.0, "crop": 0.0}
+    if given := [f"fitting.{name}" for name, value in off.items() if getattr(fitting, name) != value]:
+        raise ConfigError(
+            f"{', '.join(given)}: this reward is solved for, not descended; leave them out, or use another reward.kind"
+        )

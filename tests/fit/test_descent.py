@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from prefrl.fit.descent import UNJUDGED, Problem, _Descent
+from prefrl.fit.descent import UNJUDGED, Problem, _Descent, ensemble_loss
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.terms import terms
@@ -49,6 +49,21 @@ def problem(scores: Sequence[float], judged: Sequence[Judged[Segment]], **settin
 
 def kept(found: Problem[Segment]) -> list[float]:
     return _Descent(found, np.random.default_rng(0))._trusted()[1][0].tolist()
+
+
+def test_a_loss_on_some_judgements_scores_their_candidates_alone(make_segment: Callable[..., Segment]) -> None:
+    judged = [Judged(q, Comparison(q.id, 1.0)) for q in (Query((make_segment(), make_segment())) for _ in range(3))]
+    found = problem([1.0, 0.0, 4.0, 0.0, 3.0, 9.0], judged)
+    part, scored = found.every.subset(torch.arange(3) == 1), []
+    scores = found.reward.scores
+
+    def watched(stacked: Any) -> torch.Tensor:
+        scored.extend(stacked["at"].tolist())
+        return scores(stacked)
+
+    found.reward.scores = watched  # type: ignore[method-assign]
+    assert ensemble_loss(found, part) == pytest.approx(np.log1p(np.exp(-4.0)), rel=1e-5)
+    assert scored == [2, 3]
 
 
 def test_before_anything_is_known_the_best_of_many_is_trusted_as_much_as_a_pair(

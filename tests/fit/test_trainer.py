@@ -465,10 +465,29 @@ def test_training_metrics_are_of_training_judgements_alone(judged: list[Judged[S
     assert metrics["accuracy_held_out"] < 1.0
 
 
-def test_flipping_what_can_never_be_improbable_is_refused(judged: list[Judged[Segment]]) -> None:
-    for settings in (
-        FittingSettings(denoise="flip", error_rate=0.1),
-        FittingSettings(denoise="flip", reliability="learned"),
-    ):
-        with pytest.raises(ConfigError, match="denoise=flip"):
-            fit_judged(model(1), judged[:40], settings, np.random.default_rng(0))
+def test_judgements_that_contradict_each_other_balance(judged: list[Judged[Segment]]) -> None:
+    query = judged[0].query
+    both = [Judged(query, Comparison(query.id, p, name)) for name in ("ann", "ben") for p in (0.0, 1.0)]
+    reward = model(1)
+    settings = FittingSettings(epochs=200, held_out=0, bootstrap=False)
+    found = fit_judged(reward, both, settings, np.random.default_rng(0)).metrics
+    assert found["loss"] == pytest.approx(np.log(2), abs=1e-3)
+    assert np.ptp(reward.raw_member_scores(list(query.candidates))) < 0.05
+
+
+def test_an_assumed_error_rate_is_part_of_what_is_fitted(items: list[Segment]) -> None:
+    query = Query((items[0], items[1]))
+    judged = [Judged(query, Comparison(query.id, p)) for p in (1.0, 1.0, 1.0, 0.0)]
+    for error_rate, right in ((0.0, 0.75), (0.2, (0.75 - 0.1) / 0.8)):  # a blind answer is right half the time
+        reward: Any = Table()
+        settings = MLE.model_copy(update={"error_rate": error_rate})
+        fit_judged(reward, judged, settings, np.random.default_rng(0))
+        first, second = reward.parameters()[0][0].tolist()
+        assert 1 / (1 + np.exp(second - first)) == pytest.approx(right, abs=1e-3)
+
+
+def test_cropped_segments_still_teach(judged: list[Judged[Segment]], make_segment: Callable[..., Segment]) -> None:
+    reward = model()
+    fit_judged(reward, judged, FittingSettings(epochs=60, crop=0.4), np.random.default_rng(0))
+    fresh = [make_segment() for _ in range(200)]
+    assert pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic > 0.9
