@@ -265,13 +265,20 @@ def summary(folder: Path, trial: Trial) -> dict[str, Any]:
     verified = verify_store(folder)
     for fault in verified.faults:
         print(fault)
+    lost = sum(stored.get(submission) != [seq] for submission, seq in trial.told.items())
     return {
         "name": "label_kill",
+        "unit": "acknowledged answers that are not in the log",
+        "ours": lost,
+        "peer": 0,
+        "ratio": None,
+        "spread": None,
+        "equal_work": True,
         "kills": trial.kills,
         "answers": trial.counts["answers"],
         "sent_again": trial.counts["sent again"],
         "found_on_disk": trial.counts["found on disk"],
-        "lost": sum(stored.get(submission) != [seq] for submission, seq in trial.told.items()),
+        "lost": lost,
         "duplicates": sum(count - 1 for count in answered.values()),
         "faults": trial.faults.total(),
         "fault_kinds": dict(trial.faults),
