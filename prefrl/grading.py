@@ -34,7 +34,7 @@ from prefrl.fit.metrics import Answering, brier, calibration_error, log_losses, 
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import split
 from prefrl.fit.terms import Ties
-from prefrl.graph import batch
+from prefrl.graph import compared
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score, person
 
@@ -85,12 +85,15 @@ class Subject:
 def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
     """The report card of a fitted reward model on judgements.
 
-    Raises `ValueError` where there is no judgement that compares two candidates, where the model has not been fitted,
+    Raises `ValueError` where the judgements compare no two candidates, where the model has not been fitted,
     or where it scores a candidate as something else than a finite number.
     """
-    data = batch(subject.judged)
+    data = compared(subject.judged)
     if not len(data):
-        raise ValueError("there is nothing to grade on: expected at least one judgement of two or more candidates")
+        raise ValueError(
+            "there is nothing to grade on: expected at least one judgement of two or more candidates, or two ratings "
+            "that differ"
+        )
     if not subject.reward.fitted:
         raise ValueError("the reward model has not been fitted: fit it first, with `prefrl fit`")
     begin = perf_counter()
@@ -124,7 +127,7 @@ def of_run(
     rows = [row for row in read_metrics(folder) if row["round"] <= round]
     snapshot = next((row["fit/snapshot"] for row in reversed(rows) if row.get("fit/snapshot") is not None), 0)
     judged = judgements(store, fitting.held_out, int(snapshot))
-    if not reward.fitted or all(len(one.query.candidates) < 2 for one in judged):
+    if not reward.fitted or not len(compared(judged)):
         return None
     return Subject(
         reward,

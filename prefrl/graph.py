@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Generic
@@ -10,7 +11,7 @@ from typing import Generic
 import numpy as np
 import numpy.typing as npt
 
-from prefrl.types import C, Choice, Comparison, Floats, Integers, Judged, Judgement, Ranking
+from prefrl.types import C, Choice, Comparison, Floats, Integers, Judged, Judgement, Ranking, Rating, person
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +53,47 @@ def batch(judged: Sequence[Judged[C]]) -> Batch[C]:
         pairs = implied_pairs(one.judgement, len(at))
         share = one.judgement.weight * (len(at) - 1) / max(len(pairs), 1)
         rows += [(at[i], at[j], preference, share, group) for i, j, preference in pairs]
+    return _of_rows(tuple(candidates.values()), rows)
+
+
+def _of_rows(candidates: tuple[C, ...], rows: Sequence[tuple[int, int, float, float, int]]) -> Batch[C]:
+    """(one candidate, the other, preference, weight, judgement) for each edge."""
     columns = list(zip(*rows, strict=True)) if rows else [(), (), (), (), ()]
     return Batch(
-        candidates=tuple(candidates.values()),
+        candidates=candidates,
         edges=np.array([columns[0], columns[1]], np.int64).T.reshape(-1, 2),
         preference=np.array(columns[2], np.float32),
         weight=np.array(columns[3], np.float32),
         group=np.array(columns[4], np.int64),
     )
+
+
+def compared(judged: Sequence[Judged[C]], sides: Sequence[bool] | npt.NDArray[np.bool_] = ()) -> Batch[C]:
+    """The same, to measure a reward on: where there are ratings of single candidates alone, these are compared.
+
+    Each stands in one comparison at most, with another level of the same person's on the same scale, and of the same
+    side: `sides` (J,) tells what is held out, say. Candidates may then be of different contexts, as on a scale they are
+    compared all the same.
+    """
+    data = batch(judged)
+    return data if len(data) else _rated(data, judged, sides)
+
+
+def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool] | npt.NDArray[np.bool_]) -> Batch[C]:
+    index = {c.id: i for i, c in enumerate(data.candidates)}
+    waiting: dict[Hashable, list[tuple[int, Rating]]] = defaultdict(list)
+    rows: list[tuple[int, int, float, float, int]] = []
+    for group in sorted(range(len(judged)), key=lambda j: judged[j].query.id):
+        one, (candidate,) = judged[group].judgement, judged[group].query.candidates
+        assert isinstance(one, Rating)  # nothing else has one candidate
+        at, level = index[candidate.id], one.levels[0]
+        pile = waiting[person(one.labeler), one.scale, bool(len(sides) and sides[group])]
+        if pile and pile[-1][1].levels[0] != level:  # all of a pile have one level
+            other, before = pile.pop()
+            rows.append((other, at, float(before.levels[0] > level), (before.weight + one.weight) / 2, group))
+        else:
+            pile.append((at, one))
+    return _of_rows(data.candidates, rows)
 
 
 def implied_pairs(judgement: Judgement, size: int) -> list[tuple[int, int, float]]:

@@ -1,6 +1,6 @@
 import numpy as np
 
-from prefrl.graph import batch, implied_pairs
+from prefrl.graph import batch, compared, implied_pairs
 from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response
 
 
@@ -40,3 +40,26 @@ def test_a_judgements_weight_is_shared_by_its_pairs() -> None:
     three = Query(tuple(response(t) for t in "abc"))
     made = batch([Judged(three, Ranking(three.id, (0, 1, 2), weight=3.0))])
     np.testing.assert_allclose(made.weight, 2.0)
+
+
+def test_ratings_of_single_candidates_are_compared_where_there_is_nothing_else() -> None:
+    def rated(text: str, level: int, labeler: str = "ann", weight: float = 1.0) -> Judged[Response]:
+        query = Query((Response(f"prompt of {text}", text),))
+        return Judged(query, Rating(query.id, (level,), 5, labeler, weight=weight))
+
+    judged = [rated(str(i), i % 5) for i in range(40)]
+    made = compared(judged)
+    assert len(made) == 20, "each stands in one comparison"
+    assert sorted(made.edges.flatten().tolist()) == list(range(40))
+    levels = {c.id: j.judgement.levels[0] for c, j in zip(made.candidates, judged, strict=True)}  # type: ignore[union-attr]
+    for (first, second), preference in zip(made.edges, made.preference, strict=True):
+        one, other = (levels[made.candidates[i].id] for i in (first, second))
+        assert one != other
+        assert preference == float(one > other)
+    assert not len(compared([rated("a", 1), rated("b", 1)])), "equal levels say nothing"
+    assert not len(compared([rated("a", 1), rated("b", 2, "ben")])), "one may be strict, and the other mild"
+    assert not len(compared([rated("a", 1), rated("b", 2)], [True, False])), "one is held out"
+    assert compared([rated("a", 1, weight=1.0), rated("b", 2, weight=3.0)]).weight.tolist() == [2.0]
+    two = Query((response("a"), response("b")))
+    pair = Judged(two, Comparison(two.id, 1.0))
+    assert compared([*judged, pair]).edges.tolist() == batch([*judged, pair]).edges.tolist()

@@ -16,7 +16,7 @@ from prefrl.fit.metrics import accuracy, brier, calibration_error, temperature
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
-from prefrl.graph import Batch, batch
+from prefrl.graph import Batch, compared
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import C, Fitted, Floats, Judged, Metrics
 
@@ -58,7 +58,8 @@ def fit_judged(
         raise NothingToFit("there are no judgements to fit on; expected at least one that prefers a candidate")
     if not prefers(judged):
         raise NothingToFit(f"all {len(judged)} judgements are ties; expected at least one that prefers a candidate")
-    data, held_out = batch(judged), split(judged, fitting.held_out)
+    held_out = split(judged, fitting.held_out)
+    data = compared(judged, held_out)
     problem = _problem(reward, judged, held_out, fitting, unjudged, rng)
     if not trainable(reward):
         _check_inputs(problem)
