@@ -103,7 +103,8 @@ def interrupts() -> Iterator[Callable[[], None]]:
     """Gives a function that raises KeyboardInterrupt if Ctrl-C was pressed and came to nothing.
 
     Python drops what is raised in a destructor or in a callback of a library, Ctrl-C too; it is then heard at the end
-    of a round. Only the main thread hears of signals; elsewhere nothing changes.
+    of a round. Only the main thread hears of signals; elsewhere nothing changes, nor where Ctrl-C is ignored, as it is
+    in what a shell script starts in the background.
     """
     pressed = False
 
@@ -116,10 +117,11 @@ def interrupts() -> Iterator[Callable[[], None]]:
         if pressed:
             raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
         yield check
         return
-    before = signal.signal(signal.SIGINT, heard)
+    signal.signal(signal.SIGINT, heard)
     try:
         yield check
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,3 +104,11 @@ def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
     cache = tmp_path_factory.mktemp("models")
     cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
     return ReviewsSettings(response_tokens=24, cloning=cloning).build()
+
+
+@pytest.fixture
+def heard() -> Iterator[None]:
+    """Ctrl-C reaches this process and those that it starts, also where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

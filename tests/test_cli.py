@@ -192,6 +192,7 @@ def test_a_control_user_never_loads_transformers(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "False"
 
 
+@pytest.mark.usefixtures("heard")
 def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "prefrl", "run", "control/toy", "--out", "run", "loop.rounds=200"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as child:
@@ -206,6 +207,7 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert "Traceback" not in errors
 
 
+@pytest.mark.usefixtures("heard")
 def test_a_ctrl_c_that_a_library_swallowed_is_heard_at_the_end_of_a_round() -> None:
     with interrupts() as check:
         check()
@@ -214,6 +216,15 @@ def test_a_ctrl_c_that_a_library_swallowed_is_heard_at_the_end_of_a_round() -> N
         with pytest.raises(KeyboardInterrupt):
             check()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("heard")
+def test_a_ctrl_c_that_is_ignored_stays_ignored() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupts() as check:
+        signal.raise_signal(signal.SIGINT)
+        check()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:

@@ -129,7 +129,7 @@ def test_a_compressed_file_reads_as_a_plain_one_and_a_damaged_one_is_refused(
     [
         (RANKED | {"ranks": [0, 1]}, "ranks: expected an integer for each of 3 responses, got [0, 1]"),
         (RANKED | {"ranks": [0, 1, True]}, "ranks: expected an integer"),
-        (RANKED | {"ranks": [0, -1, 1]}, "a rank >= 0"),
+        (RANKED | {"ranks": [0, -1, 1]}, "a whole rank >= 0"),
         (RANKED | {"responses": ["a"], "ranks": [0]}, "at least 2 candidates"),
         (RANKED | {"responses": ["a", "a", "b"]}, "may not compare a candidate with itself"),
         (RANKED | {"best": 0}, "expected one of ranks, best, ratings, preference, skip, got ranks, best"),
