@@ -178,10 +178,10 @@ def _shorten(gradients: list[Tensor], most: float) -> float:
 
     torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
     """
-    norm = float(torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients))))
+    norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     if norm > most:
-        torch._foreach_mul_(gradients, most / norm)
-    return norm
+        torch._foreach_mul_(gradients, most / (norm + 1e-6))
+    return float(norm)
 
 
 def _alternate(problem: Problem[C]) -> None:
