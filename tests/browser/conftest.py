@@ -40,8 +40,11 @@ def chromium() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def visit(chromium: Browser) -> Iterator[Visit]:
-    """Open a link in a browser of one's own: `visit(link)`. In the end each is asked what went wrong."""
+def visit(chromium: Browser, open_house: Open) -> Iterator[Visit]:
+    """Open a link in a browser of one's own: `visit(link)`. In the end each is asked what went wrong.
+
+    Houses are closed after the browsers, whichever a test names first: a page asks its server again and again.
+    """
     visitors: list[Visitor] = []
 
     def come(link: str, **options: Any) -> Visitor:
