@@ -139,8 +139,7 @@ def fit(
     console.print(metrics_table(f"reward model in {out}", fitted.metrics))
     count = len(fitted.predicted)
     few = f"only {count} comparisons were held out: their accuracy says little"
-    if not fitted.metrics["held_out"]:
-        few = "nothing was held out"
+    few = few if fitted.metrics["held_out"] else "nothing was held out"
     for note in [*notes, *([few] if count < FEW else [])]:
         say(note, "yellow")
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from prefrl.blobs import read_arrays
 from prefrl.engines import StoreError
+from prefrl.numeric import is_whole
 from prefrl.projection import ANSWERS
 from prefrl.types import (
     Answer,
@@ -93,12 +94,11 @@ def check_answer(answer: Answer, size: int) -> None:
         case Comparison(preference=preference):
             good, expected = _is_finite(preference), "a preference that is a number"
         case Ranking(ranks=ranks):
-            good, expected = all(map(is_whole, ranks)), f"ranks that are whole numbers up to {LARGEST}"
-        case Choice(best=best):
-            good, expected = is_whole(best), "the number of the best candidate"
-        case Rating(levels=levels, scale=scale):
-            good = is_whole(scale, LEVELS) and all(map(is_whole, levels))
-            expected = f"levels that are whole numbers, on a scale of at most {LEVELS}"
+            good, expected = max(ranks) <= LARGEST, f"ranks that are whole numbers up to {LARGEST}"
+        case Choice():
+            good, expected = True, ""  # it is no larger than the query, see `check_fits`
+        case Rating(scale=scale):
+            good, expected = scale <= LEVELS, f"a scale of at most {LEVELS} levels"
         case Skip(reason=reason):
             good, expected = reason in ("skip", "incomparable"), "the reason skip or incomparable"
     if not good:
@@ -109,11 +109,6 @@ def check_text(name: str, value: Any) -> None:
     """Raise `ValueError` unless a value is text that every database can hold."""
     if not isinstance(value, str) or _NO_TEXT.search(value):
         raise ValueError(f"{name}: expected text that is valid Unicode, without NUL, got {value!r:.200}")
-
-
-def is_whole(value: Any, most: int = LARGEST) -> bool:
-    """Whether a JSON value is a whole number from 0 on, true and false not among them."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
 
 
 def _is_finite(value: Any) -> bool:
@@ -183,7 +178,7 @@ def check_assignment(body: Mapping[str, Any], size: int) -> None:
 def check_purpose(body: Mapping[str, Any], size: int) -> None:
     """What a query of `size` candidates was asked for. Raises `StoreError`."""
     purpose, expected = body.get("purpose", "label"), body.get("expected")
-    if purpose not in ("label", "check") or not is_whole(body.get("batch", 0)):
+    if purpose not in ("label", "check") or not is_whole(body.get("batch", 0), LARGEST):
         raise StoreError(f"a query has a purpose, label or check, and the number of its batch, got {body!r:.200}")
     if (purpose == "check") != is_whole(expected, size - 1) or (purpose == "label" and expected is not None):
         raise StoreError(f"a query is a check, and names its best candidate, or neither, got {body!r:.200}")
@@ -195,12 +190,12 @@ def load_foreign(id: str, body: dict[str, Any], blobs: Path) -> Candidate:
     if body != describe(loaded) or not all(isinstance(body.get(n, ""), str) for n in ("prompt", "text", "episode")):
         raise StoreError(f"candidate {id[:12]} is not described as it is: {body!r:.200}")
     if isinstance(loaded, Segment):
-        if not is_whole(loaded.start):
+        if not is_whole(loaded.start, LARGEST):
             raise StoreError(f"candidate {id[:12]} starts at step {loaded.start!r:.40}; expected a number from 0 on")
         for name in ("observations", "actions"):
             array = getattr(loaded, name)
             if array.dtype.kind != "f" or not np.isfinite(array).all():
                 raise StoreError(f"candidate {id[:12]}: its {name} are not all finite floats")
-    elif not all(is_whole(token) for token in (*loaded.prompt_tokens, *loaded.tokens)):
+    elif not all(is_whole(token, LARGEST) for token in (*loaded.prompt_tokens, *loaded.tokens)):
         raise StoreError(f"candidate {id[:12]} has tokens that are no numbers from 0 on")
     return loaded

@@ -68,7 +68,7 @@ def _of_rows(candidates: tuple[C, ...], rows: Sequence[tuple[int, int, float, fl
     )
 
 
-def compared(judged: Sequence[Judged[C]], sides: Sequence[bool] | npt.NDArray[np.bool_] = ()) -> Batch[C]:
+def compared(judged: Sequence[Judged[C]], sides: Sequence[bool] = ()) -> Batch[C]:
     """The same, to measure a reward on: where there are ratings of single candidates alone, these are compared.
 
     Each stands in one comparison at most, with another level of the same person's on the same scale, and of the same
@@ -79,7 +79,7 @@ def compared(judged: Sequence[Judged[C]], sides: Sequence[bool] | npt.NDArray[np
     return data if len(data) else _rated(data, judged, sides)
 
 
-def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool] | npt.NDArray[np.bool_]) -> Batch[C]:
+def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool]) -> Batch[C]:
     index = {c.id: i for i, c in enumerate(data.candidates)}
     waiting: dict[Hashable, list[tuple[int, Rating]]] = defaultdict(list)
     rows: list[tuple[int, int, float, float, int]] = []
@@ -87,7 +87,7 @@ def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool] | 
         one, (candidate,) = judged[group].judgement, judged[group].query.candidates
         assert isinstance(one, Rating)  # nothing else has one candidate
         at, level = index[candidate.id], one.levels[0]
-        pile = waiting[person(one.labeler), one.scale, bool(len(sides) and sides[group])]
+        pile = waiting[person(one.labeler), one.scale, sides[group] if sides else None]
         if pile and pile[-1][1].levels[0] != level:  # all of a pile have one level
             other, before = pile.pop()
             rows.append((other, at, float(before.levels[0] > level), (before.weight + one.weight) / 2, group))

@@ -33,15 +33,15 @@ _SIZE = sql.select(asked.c.id, asked.c.size).where(asked.c.id == sql.bindparam("
 class Store(Generic[C]):
     """A store in a folder (see the module's docstring); fits `prefrl.protocols.Store`."""
 
-    def __init__(self, folder: Path, write: bool = True, url: str | None = None) -> None:
+    def __init__(self, folder: str | Path, write: bool = True, url: str | None = None) -> None:
         """Open, or make, the store of a folder.
 
         Raises `StoreError` where another process is writing to it, where it is missing (for reading), damaged, or
         from a newer prefrl. `url` names another SQLAlchemy database for the log; so does a file `store.url` in the
         folder.
         """
-        self.folder = folder
-        self.log = EventLog(folder, write, url)
+        self.folder = Path(folder)
+        self.log = EventLog(self.folder, write, url)
         self._queries: dict[str, tuple[str, ...]] = {}
         self._loaded: dict[str, C] = {}
 

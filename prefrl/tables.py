@@ -8,6 +8,8 @@ from typing import Any
 
 import sqlalchemy as sql
 
+from prefrl.numeric import plain
+
 SCHEMA = 2
 metadata = sql.MetaData()
 
@@ -26,8 +28,8 @@ class CanonicalJSON(sql.types.TypeDecorator[Any]):
 
 
 def canonical(value: Any) -> str:
-    """The one text of a JSON value. Raises `ValueError` for NaN and infinities."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    """The one text of a JSON value, NumPy's numbers included. Raises `ValueError` for NaN and infinities."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=plain)
 
 
 event = sql.Table(

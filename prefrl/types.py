@@ -14,6 +14,8 @@ from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from prefrl.numeric import check_weight, is_whole
+
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Integers: TypeAlias = npt.NDArray[np.integer[Any]]
 Metrics: TypeAlias = dict[str, float]
@@ -134,7 +136,7 @@ class Comparison:
     """How much the judgement counts in a fit."""
 
     def __post_init__(self) -> None:
-        _check_weight(self.weight)
+        check_weight(self.weight)
         if not 0.0 <= self.preference <= 1.0:
             raise ValueError(f"a preference must lie in [0, 1], got {self.preference}")
 
@@ -151,8 +153,8 @@ class Ranking:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_weight(self.weight)
-        if len(self.ranks) < 2 or not all(_is_count(rank) for rank in self.ranks):
+        check_weight(self.weight)
+        if len(self.ranks) < 2 or not all(is_whole(rank) for rank in self.ranks):
             raise ValueError(f"a ranking needs a whole rank >= 0 for each of at least 2 candidates, got {self.ranks}")
 
 
@@ -168,8 +170,8 @@ class Choice:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_weight(self.weight)
-        if not _is_count(self.best):
+        check_weight(self.weight)
+        if not is_whole(self.best):
             raise ValueError(f"the best candidate is counted from 0, got {self.best}")
 
 
@@ -187,9 +189,9 @@ class Rating:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_weight(self.weight)
-        right = all(_is_count(level) and level < self.scale for level in self.levels)
-        if not (_is_count(self.scale) and self.scale >= 2 and self.levels and right):
+        check_weight(self.weight)
+        right = all(is_whole(level) and level < self.scale for level in self.levels)
+        if not (is_whole(self.scale) and self.scale >= 2 and self.levels and right):
             raise ValueError(
                 f"a rating needs whole levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}"
             )
@@ -295,13 +297,3 @@ def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
         digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _is_count(value: object) -> bool:
-    """Whether it is a whole number >= 0; NumPy's integers are, floats and booleans are not."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
-
-
-def _check_weight(weight: float) -> None:
-    if not 0.0 < weight < float("inf"):
-        raise ValueError(f"a judgement's weight must be positive and finite, got {weight}")

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -167,6 +168,7 @@ def test_of_two_answers_given_at_once_the_first_stands(store: Store[Segment], ma
 KILLED = """
 import os, signal, sys
 from pathlib import Path
+from typing import Any, cast
 from prefrl.store import Store
 from prefrl.types import *
 store = Store(Path(sys.argv[1]))
@@ -229,3 +231,15 @@ def test_progress_counts_queries_however_many_people_answer(text_store: Store[Re
     text_store.answer([Skip(queries[0].id, "skip", "d"), Skip(queries[1].id, "skip", "d")])
     text_store.answer([Skip(queries[1].id, "incomparable", "e"), Skip(queries[2].id, "incomparable", "e")])
     assert text_store.progress() == (4, 1, 2)
+
+
+def test_numbers_that_numpy_made_are_kept(folder: Path) -> None:
+    query, pair = Query(tuple(Response("p", text) for text in "abc")), Query((Response("p", "a"), Response("p", "d")))
+    ranks: Any = tuple(np.argsort([3, 1, 2]))
+    with Store[Response](str(folder)) as store:
+        store.ask([query, pair])
+        store.answer([Ranking(query.id, ranks, "ann"), Comparison(pair.id, float(np.float32(0.25)), "ann")])
+        store.answer([Comparison(pair.id, cast(Any, np.float32(0.75)), "ben")])
+    with Store[Response](folder, write=False) as store:
+        assert [a.ranks for a in store.answers() if isinstance(a, Ranking)] == [(1, 2, 0)]
+        assert [a.preference for a in store.answers() if isinstance(a, Comparison)] == [0.25, 0.75]

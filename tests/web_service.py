@@ -15,7 +15,8 @@ from prefrl.label.server import api
 from prefrl.label.server.app import create_app
 from prefrl.label.server.questions import Policy
 from prefrl.label.server.security import Buckets
-from prefrl.label.server.service import Service, Terms
+from prefrl.label.server.service import Service
+from prefrl.label.server.terms import Terms
 from prefrl.store import Store
 
 ORIGIN = "http://127.0.0.1:8900"

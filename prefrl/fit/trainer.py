@@ -59,7 +59,7 @@ def fit_judged(
     if not prefers(judged):
         raise NothingToFit(f"all {len(judged)} judgements are ties; expected at least one that prefers a candidate")
     held_out = split(judged, fitting.held_out)
-    data = compared(judged, held_out)
+    data = compared(judged, held_out.tolist())
     problem = _problem(reward, judged, held_out, fitting, unjudged, rng)
     if not trainable(reward):
         _check_inputs(problem)

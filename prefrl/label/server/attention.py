@@ -7,9 +7,15 @@ from sqlalchemy import Connection
 
 from prefrl.events import read_answer
 from prefrl.label.server.ledger import best
+from prefrl.label.server.tallies import shortfall
 from prefrl.resampling import Measured, share
 from prefrl.tables import assignment, event, query
 from prefrl.types import Skip
+
+
+def failing(connection: Connection, name: str, least: float) -> str:
+    """Why a person is to be paused: they surely answer a smaller share of checks as expected; "" where they may not."""
+    return shortfall("checks", attention(connection, name), least)
 
 
 def attention(connection: Connection, name: str) -> Measured:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Condition, Lock
@@ -19,8 +19,9 @@ from prefrl.label.server.access import Access, Event
 from prefrl.label.server.cards import Cards, ClipSource
 from prefrl.label.server.desk import Desk
 from prefrl.label.server.intake import Intake, Reopened, Taken
-from prefrl.label.server.questions import Given, Policy
+from prefrl.label.server.questions import Given
 from prefrl.label.server.security import Buckets, Refused
+from prefrl.label.server.terms import Terms, ignored
 from prefrl.label.server.texts import (
     TEXT,
     Consent,
@@ -37,32 +38,8 @@ from prefrl.types import Query
 
 if TYPE_CHECKING:
     from prefrl.label.server.figures import Dashboard
-    from prefrl.resampling import Measured
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Terms:
-    """What a project asks, and how."""
-
-    page: api.Page
-    policy: Policy
-    strengths: dict[str, float]
-    """slight, clear and much as preferences."""
-    guideline: str = ""
-    """Its text at the beginning."""
-    consent: str = ""
-    """What people agree to before their first question; "" for nothing."""
-    fps: float = 0.0
-    fixed: bool = False
-    """No more questions will come: who has answered all is done."""
-    check_warn: float = 0.8
-    """Admins are told of who surely answers fewer check questions than this share as expected."""
-    check_pause: float = 0.0
-    """Who surely answers fewer than this share is paused, until an admin has them go on."""
-    rate: float = 10.0
-    """Requests a second that one person may make; three times as many at once."""
 
 
 @dataclass(eq=False)
@@ -160,7 +137,7 @@ class Service:
     async def answer(self, name: str, sent: api.Answer) -> api.Receipt:
         taken = await self.write(lambda tx: self.intake.answer(tx, name, sent), self._taken)
         if self.terms.check_pause and taken.given is not None and taken.given.purpose == "check":
-            await self._pause_unlooking(name)
+            await self._look_at_checks(name)
         return api.Receipt(seq=taken.seq, duplicate=taken.duplicate)
 
     async def undo(self, name: str, sent: api.Undo) -> api.Undone:
@@ -264,21 +241,19 @@ class Service:
         if not self.desk.knows(name):
             self.desk.tell(name, past)
 
-    async def _pause_unlooking(self, name: str) -> None:
+    async def _look_at_checks(self, name: str) -> None:
         """Pause an annotator who surely fails too many check questions."""
-        who, least = self.access.person(name), self.terms.check_pause
+        who = self.access.person(name)
         if who is None or who.role != "annotator" or who.state != "active":
             return
-        found = await run_in_threadpool(self._attention, name)
-        if found.value is not None and found.high is not None and found.high < least:
-            why = f"checks answered as expected: {found.value:.0%} of {found.count}, less than {least:.0%}"
+        if why := await run_in_threadpool(self._failing, name):
             await self.record(self.access.change(name, "paused", why))
 
-    def _attention(self, name: str) -> Measured:
-        from prefrl.label.server.attention import attention  # it needs scipy; see `dashboard`
+    def _failing(self, name: str) -> str:
+        from prefrl.label.server.attention import failing  # it needs scipy; see `dashboard`
 
         with self.store.log.reading() as connection:
-            return attention(connection, name)
+            return failing(connection, name, self.terms.check_pause)
 
     def _history(self, name: str) -> list[api.Entry]:
         with self.store.log.reading() as connection:
@@ -306,17 +281,3 @@ class Service:
     def _noted(self, events: list[Event], numbers: list[int]) -> None:
         self.seq = max(self.seq, *numbers, 0)
         self.access.note([one for one in events if one["kind"] in ("annotator", "state", "token", "revoke")])
-
-
-def ignored(terms: Terms, overlap: int, guideline: api.Guideline) -> Iterator[str]:
-    """Which settings do not hold, since the store knows others: `overlap` and `guideline` do."""
-    if overlap != terms.policy.overlap:
-        yield (
-            f"labeler.overlap={terms.policy.overlap} is not used: an admin has set {overlap} on the page, and can "
-            "change it there"
-        )
-    if terms.guideline not in ("", guideline.text):
-        yield (
-            f"labeler.guideline is not used: the store has one already (version {guideline.version}), which an admin "
-            "can change on the page"
-        )

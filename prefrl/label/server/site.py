@@ -15,7 +15,8 @@ from prefrl.label.server.clips import Clips
 from prefrl.label.server.questions import Policy
 from prefrl.label.server.security import LOOPBACK, Rules
 from prefrl.label.server.serve import WebServer, check_tls
-from prefrl.label.server.service import Service, Terms
+from prefrl.label.server.service import Service
+from prefrl.label.server.terms import Terms
 from prefrl.protocols import ControlTask
 from prefrl.store import Store
 

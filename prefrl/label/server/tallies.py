@@ -151,12 +151,17 @@ def concerns(row: AnnotatorRow, check_warn: float = 0.8) -> list[str]:
             side = "left" if row.left.value > 0.5 else "right"
             found.append(f"prefers the {side} side: {row.left.value:.0%} left of {row.left.count}, p = {p:.2g}")
     for name, low in (("checks", check_warn), ("repeats", 0.6)):
-        rate: Interval = getattr(row, name)
-        if rate.value is not None and rate.high is not None and rate.high < low:
-            found.append(f"{name} answered as expected: {rate.value:.0%} of {rate.count}, less than {low:.0%}")
+        found += filter(None, [shortfall(name, getattr(row, name), low)])
     if row.answers >= 5 and row.too_fast > 0.2 * row.answers:
         found.append(f"faster than half a clip in {row.too_fast} of {row.answers} answers")
     return found
+
+
+def shortfall(name: str, rate: Interval | Measured, low: float) -> str:
+    """In words, that what should be answered as expected surely is less often than that; "" where it may not be."""
+    if rate.value is None or rate.high is None or rate.high >= low:
+        return ""
+    return f"{name} answered as expected: {rate.value:.0%} of {rate.count}, less than {low:.0%}"
 
 
 def interval(measured: Measured) -> Interval:

@@ -15,7 +15,8 @@ from web_service import STRENGTHS, answering, ask_for, log_in, page
 from prefrl.label.server import records
 from prefrl.label.server.attention import attention
 from prefrl.label.server.questions import Policy
-from prefrl.label.server.service import Service, Terms
+from prefrl.label.server.service import Service
+from prefrl.label.server.terms import Terms
 from prefrl.store import Store
 
 

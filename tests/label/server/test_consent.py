@@ -15,7 +15,8 @@ from web_service import STRENGTHS, answering, ask_for, browser, log_in, page
 
 from prefrl.label.server.people import cookie_name
 from prefrl.label.server.questions import Policy
-from prefrl.label.server.service import Service, Terms
+from prefrl.label.server.service import Service
+from prefrl.label.server.terms import Terms
 from prefrl.label.server.texts import version_of
 from prefrl.store import Store
 

@@ -28,7 +28,8 @@ from web_service import STRENGTHS, Clock, answering, page
 from prefrl.label.server import api, desk, records
 from prefrl.label.server.questions import Policy
 from prefrl.label.server.security import Refused
-from prefrl.label.server.service import Service, Terms
+from prefrl.label.server.service import Service
+from prefrl.label.server.terms import Terms
 from prefrl.maintenance import verify_store
 from prefrl.store import Store
 
