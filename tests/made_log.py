@@ -12,7 +12,7 @@ from prefrl.label.server import tallies
 from prefrl.label.server.api import AgreementRow
 from prefrl.label.server.ledger import Ledger
 from prefrl.log import row
-from prefrl.resampling import Measured
+from prefrl.stats.intervals import Measured
 
 NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
 

@@ -10,7 +10,7 @@ from scipy.special import expit, log_expit, logsumexp
 
 from prefrl.evaluate.card import Bucket, Estimate, LabelerPart, Members, undefined
 from prefrl.evaluate.intervals import share
-from prefrl.raters import cohen
+from prefrl.stats.raters import cohen
 from prefrl.types import Floats, Integers
 
 BUCKETS = 4

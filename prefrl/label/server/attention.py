@@ -8,7 +8,7 @@ from sqlalchemy import Connection
 from prefrl.events import read_answer
 from prefrl.label.server.ledger import best
 from prefrl.label.server.tallies import shortfall
-from prefrl.resampling import Measured, share
+from prefrl.stats.intervals import Measured, share
 from prefrl.tables import assignment, event, query
 from prefrl.types import Skip
 

@@ -16,7 +16,7 @@ from prefrl.label.server import tallies
 from prefrl.label.server.api import AgreementRow, AnnotatorRow
 from prefrl.label.server.ledger import KINDS, SKIPPED, Ledger
 from prefrl.label.server.tallies import Mask, Rows, interval
-from prefrl.resampling import Measured, share
+from prefrl.stats.intervals import Measured, share
 from prefrl.tables import annotator, event
 from prefrl.tables import query as asked
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from prefrl.label.server.api import AgreementRow, AnnotatorRow, Interval
 from prefrl.label.server.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger
-from prefrl.raters import (
+from prefrl.stats.intervals import Measured, position_test, share
+from prefrl.stats.raters import (
     Ratings,
     agreement_with_others,
     cohen_kappa,
@@ -19,8 +20,7 @@ from prefrl.raters import (
     krippendorff_alpha,
     raw_agreement,
 )
-from prefrl.resampling import Measured, position_test, share
-from prefrl.triads import circular_triads
+from prefrl.stats.triads import circular_triads
 from prefrl.types import Floats
 
 Rows = dict[str, Floats]

@@ -10,7 +10,7 @@ from made_log import NOW, Made, sweep
 from prefrl.label.server import tallies
 from prefrl.label.server.api import AnnotatorRow
 from prefrl.label.server.ledger import LEFT, RIGHT, TIE, UNKNOWN, best, first_shown, said
-from prefrl.resampling import position_test, share
+from prefrl.stats.intervals import position_test, share
 from prefrl.types import Answer, Choice, Comparison, Ranking, Rating, Skip
 
 Generator = np.random.Generator

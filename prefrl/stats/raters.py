@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 from scipy.sparse import coo_array, csr_array
 
-from prefrl.resampling import RESAMPLES, Measured, defined, draws, mean, numbered, patterns, resampled
+from prefrl.stats.intervals import RESAMPLES, Measured, defined, draws, mean, numbered, patterns, resampled
 from prefrl.types import Floats, Integers
 
 MOST_CATEGORIES = 32

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from prefrl.resampling import RESAMPLES, Measured, mean
+from prefrl.stats.intervals import RESAMPLES, Measured, mean
 from prefrl.types import Floats, Integers
 
 MOST_TRIADS = 200_000

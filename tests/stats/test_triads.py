@@ -5,8 +5,8 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 
-from prefrl import triads
-from prefrl.triads import circular_triads
+from prefrl.stats import triads
+from prefrl.stats.triads import circular_triads
 
 Generator = np.random.Generator
 

@@ -13,7 +13,8 @@ from scipy import stats
 from statsmodels.stats import inter_rater
 from statsmodels.stats.proportion import proportion_confint
 
-from prefrl.raters import (
+from prefrl.stats.intervals import Measured, mean, position_test, share
+from prefrl.stats.raters import (
     Ratings,
     agreement_with_others,
     cohen,
@@ -23,7 +24,6 @@ from prefrl.raters import (
     krippendorff_alpha,
     raw_agreement,
 )
-from prefrl.resampling import Measured, mean, position_test, share
 from prefrl.types import Floats
 
 Generator = np.random.Generator
