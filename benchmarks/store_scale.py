@@ -26,7 +26,7 @@ from prefrl.label.server import api
 from prefrl.label.server.questions import Policy
 from prefrl.label.server.service import Service
 from prefrl.label.server.terms import Terms
-from prefrl.log import row
+from prefrl.storage.log import row
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response
 

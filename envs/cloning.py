@@ -29,8 +29,8 @@ from transformers.utils.logging import disable_progress_bar, enable_progress_bar
 
 from prefrl.components import Settings
 from prefrl.envs.grammar import Grammar
-from prefrl.files import DamagedError, verify, whole_folder
 from prefrl.seeding import draw_seed
+from prefrl.storage.files import DamagedError, verify, whole_folder
 
 RECIPE = 1
 """Raise this when the same settings lead to another model: what older versions kept is then left alone."""

@@ -93,8 +93,8 @@ def label(
     """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
     from prefrl import stages
     from prefrl.console import say
-    from prefrl.log import has_store
     from prefrl.rundir import open_saved
+    from prefrl.storage.log import has_store
 
     there = serve and has_store(Path(source))
     _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")

@@ -131,7 +131,7 @@ def _import(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
 
 def _try(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
     from prefrl.label.exchange import try_import
-    from prefrl.log import has_store
+    from prefrl.storage.log import has_store
     from prefrl.store import Store
 
     if not has_store(out):
@@ -143,7 +143,7 @@ def _try(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
 @contextmanager
 def _store(folder: Path) -> Iterator[Store[Any]]:
     """The store of a folder. One that had to be made is removed again where something fails."""
-    from prefrl.log import has_store
+    from prefrl.storage.log import has_store
     from prefrl.store import Store
 
     made = [path for path in (folder, *folder.parents) if not path.exists()]

@@ -22,8 +22,8 @@ def verify(
     ] = None,
 ) -> None:
     """Check a store: its database, its chain of hashes, what is derived from it, its files."""
-    from prefrl import maintenance
     from prefrl.console import say
+    from prefrl.storage import maintenance
 
     if salvage is not None:
         found = maintenance.salvage(folder, salvage)
@@ -47,7 +47,7 @@ def backup(
 ) -> None:
     """Copy a store, also while people label, and check the copy."""
     from prefrl.console import say
-    from prefrl.maintenance import backup as back_up
+    from prefrl.storage.maintenance import backup as back_up
 
     say(f"{back_up(folder, to)} events copied into {to}")
 
@@ -56,8 +56,8 @@ def backup(
 def migrate(folder: Folder) -> None:
     """Bring a store that an older prefrl made up to date; a copy of its database is kept in backups/."""
     from prefrl.console import say
-    from prefrl.log import EventLog, require_store
-    from prefrl.tables import SCHEMA
+    from prefrl.storage.log import EventLog, require_store
+    from prefrl.storage.tables import SCHEMA
 
     require_store(folder)
     EventLog(folder, write=True).close()

@@ -23,9 +23,9 @@ from typing import Any, TextIO, cast
 import yaml
 
 from prefrl.components import settings_class
-from prefrl.files import write_file
 from prefrl.label.clips import NAME, encode
 from prefrl.protocols import ControlTask
+from prefrl.storage.files import write_file
 from prefrl.store import Store
 from prefrl.types import Segment
 

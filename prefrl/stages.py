@@ -12,13 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.checkpoints import load_state
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.report import render_card
 from prefrl.evaluate.summary import read_metrics
-from prefrl.files import check_free, read_lines, write_file
 from prefrl.fit.trainer import fit
 from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.graph import batch
@@ -27,6 +25,8 @@ from prefrl.label.source import open_judgements
 from prefrl.protocols import Attended
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
+from prefrl.storage.checkpoints import load_state
+from prefrl.storage.files import check_free, read_lines, write_file
 from prefrl.store import Store
 from prefrl.types import Evaluation, Fitted, Query, Response
 

@@ -16,13 +16,13 @@ from typing import Any, Generic
 
 import sqlalchemy as sql
 
-from prefrl.arrivals import Merged, check_arrivals
-from prefrl.blobs import read_arrays, write_arrays
-from prefrl.events import ANSWER_TYPES, describe, load_candidate, read_answer
-from prefrl.log import EventLog, StoreError, Transaction, row
-from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
-from prefrl.tables import event, standing
-from prefrl.tables import query as asked
+from prefrl.storage.arrivals import Merged, check_arrivals
+from prefrl.storage.blobs import read_arrays, write_arrays
+from prefrl.storage.events import ANSWER_TYPES, describe, load_candidate, read_answer
+from prefrl.storage.log import EventLog, StoreError, Transaction, row
+from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
+from prefrl.storage.tables import event, standing
+from prefrl.storage.tables import query as asked
 from prefrl.types import Answer, C, Candidate, Floats, Judged, Query, Segment, Skip, check_fits
 
 WRITERS = 16

@@ -14,7 +14,6 @@ import torch
 from transformers import AutoModelForSequenceClassification, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
-from prefrl.files import whole_folder, write_file
 from prefrl.protocols import TextTask
 from prefrl.reward_models.backbone import (
     Backbone,
@@ -27,6 +26,7 @@ from prefrl.reward_models.backbone import (
 )
 from prefrl.reward_models.packing import ATTENTION
 from prefrl.reward_models.text import TransformerReward, TransformerSettings
+from prefrl.storage.files import whole_folder, write_file
 
 PAD = "<|pad|>"
 """Added to a tokenizer whose padding could be taken for the end of a response."""

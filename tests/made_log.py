@@ -11,8 +11,8 @@ import numpy as np
 from prefrl.label.server import tallies
 from prefrl.label.server.api import AgreementRow
 from prefrl.label.server.ledger import Ledger
-from prefrl.log import row
 from prefrl.stats.intervals import Measured
+from prefrl.storage.log import row
 
 NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
 

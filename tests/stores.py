@@ -8,8 +8,8 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from prefrl.log import row
-from prefrl.projection import dump
+from prefrl.storage.log import row
+from prefrl.storage.projection import dump
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Query, Ranking, Response, Skip
 

@@ -7,7 +7,7 @@ from stores import fill
 from typer.testing import CliRunner
 
 from prefrl.cli import app
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Response
 

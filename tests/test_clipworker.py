@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from prefrl.clipworker import Artist, JobError, _lasting, _sentence
-from prefrl.engines import StoreError
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.render import graphics
 from prefrl.envs.toys import PointTask
 from prefrl.label.clips import formats, whole
+from prefrl.storage.engines import StoreError
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 

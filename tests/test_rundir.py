@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from prefrl import Config
-from prefrl.checkpoints import load_state
 from prefrl.components import ConfigError
 from prefrl.rundir import Run, RunError, open_saved
 from prefrl.stages import label, with_reward
+from prefrl.storage.checkpoints import load_state
 from prefrl.store import Store
 
 TOYS = ["control/toy", "text/toy"]

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from stores import derived, fill, responses
 
-from prefrl.files import DamagedError
-from prefrl.log import StoreError
-from prefrl.maintenance import backup, verify_store
-from prefrl.projection import dump, rebuild
+from prefrl.storage.files import DamagedError
+from prefrl.storage.log import StoreError
+from prefrl.storage.maintenance import backup, verify_store
+from prefrl.storage.projection import dump, rebuild
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 

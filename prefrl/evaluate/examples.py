@@ -12,8 +12,8 @@ from typing import Any, cast
 import numpy as np
 from PIL import Image
 
-from prefrl.files import write_file
 from prefrl.protocols import ControlTask, Task
+from prefrl.storage.files import write_file
 from prefrl.types import Candidate, Floats, Response, Segment, gold_score
 
 FRAMES = 6

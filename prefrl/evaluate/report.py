@@ -15,7 +15,7 @@ from prefrl.evaluate.chapters import chapters
 from prefrl.evaluate.facts import calibration, gather
 from prefrl.evaluate.records import Record, read, visible
 from prefrl.evaluate.words import headline, show_count, show_number, show_share, show_time, verdict
-from prefrl.files import write_file
+from prefrl.storage.files import write_file
 
 
 def write_report(folder: Path) -> Path:

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from prefrl.arrivals import Merged, check_arrivals
-from prefrl.events import PORTABLE
-from prefrl.files import MANIFEST, DamagedError, whole_folder, write_file
 from prefrl.label.exports.given import Exported, json_text, whole_file
 from prefrl.label.reading import parse_json, read_lines, refuse_links
-from prefrl.projection import ANSWERS
+from prefrl.storage.arrivals import Merged, check_arrivals
+from prefrl.storage.events import PORTABLE
+from prefrl.storage.files import MANIFEST, DamagedError, whole_folder, write_file
+from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
 
 EVENTS = "events.jsonl"

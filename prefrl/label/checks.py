@@ -12,8 +12,8 @@ from typing import Generic, NamedTuple
 
 import numpy as np
 
-from prefrl.files import DamagedError
 from prefrl.protocols import Store
+from prefrl.storage.files import DamagedError
 from prefrl.types import C, Floats, Integers, Query, Segment
 
 MOST = 1000

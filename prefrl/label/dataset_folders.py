@@ -15,7 +15,7 @@ from typing import Any
 from prefrl.label.formats import Layout, Parts, Row
 from prefrl.label.reading import list_files, refuse_links
 from prefrl.label.text_rows import text_rows
-from prefrl.log import has_store
+from prefrl.storage.log import has_store
 
 PATTERNS = (("*.parquet",), ("*.jsonl", "*.jsonl.gz"), ("*.json", "*.json.gz"), ("*.csv", "*.csv.gz"))
 SPLITS = re.compile(r"(train|test|validation|valid|dev|eval)(?=[-_.]|\Z)")

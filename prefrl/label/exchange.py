@@ -9,9 +9,6 @@ from typing import Any
 
 import sqlalchemy as sql
 
-from prefrl.arrivals import Against, otherwise
-from prefrl.blobs import write_arrays
-from prefrl.events import describe, read_answer
 from prefrl.label.bundles import export_bundle, import_bundle, is_bundle, try_bundle
 from prefrl.label.exports.dataset import export_dataset
 from prefrl.label.exports.given import Exported
@@ -21,10 +18,13 @@ from prefrl.label.exports.table import export_csv
 from prefrl.label.exports.tools import export_arena, export_argilla, export_label_studio
 from prefrl.label.formats import Layout, Row, Which, check_file
 from prefrl.label.recognition import recognised
-from prefrl.log import StoreError, Transaction, row
-from prefrl.projection import CHUNK, RETRACTED, chunks, words
+from prefrl.storage.arrivals import Against, otherwise
+from prefrl.storage.blobs import write_arrays
+from prefrl.storage.events import describe, read_answer
+from prefrl.storage.log import StoreError, Transaction, row
+from prefrl.storage.projection import CHUNK, RETRACTED, chunks, words
+from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.tables import event
 from prefrl.types import Answer, Candidate, Segment
 
 

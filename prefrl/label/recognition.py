@@ -14,7 +14,7 @@ import sqlalchemy as sql
 
 from prefrl.label.exports.given import stored_queries
 from prefrl.label.formats import Row
-from prefrl.tables import query as asked
+from prefrl.storage.tables import query as asked
 from prefrl.types import Answer, Candidate, Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
 
 QUERY = re.compile("[0-9a-f]{64}")

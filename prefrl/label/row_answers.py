@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from prefrl.events import check_answer
 from prefrl.label.formats import Row
 from prefrl.numeric import is_whole
+from prefrl.storage.events import check_answer
 from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
 
 VERDICTS = ("ranks", "best", "ratings", "preference", "skip")

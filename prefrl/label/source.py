@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from prefrl.label.exchange import import_judgements
 from prefrl.label.formats import Which
-from prefrl.projection import ANSWERS
+from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
 from prefrl.types import Judged, Segment, person
 

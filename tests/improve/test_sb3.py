@@ -15,13 +15,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from prefrl.checkpoints import load_state, save_state
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.improve.rollout import learned_rewards
 from prefrl.improve.sb3 import SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
+from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
 from prefrl.types import Floats, Segment, Steps
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from stores import fill, seal
 
-from prefrl import log
 from prefrl.label.bundles import export_bundle, import_bundle
 from prefrl.label.exchange import import_judgements, try_import
 from prefrl.label.formats import Layout
-from prefrl.log import StoreError
+from prefrl.storage import log
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from prefrl.label.exchange import export_bundle, export_preferences, import_bundle, import_judgements
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment
 

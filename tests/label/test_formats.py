@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from prefrl.label.exchange import import_judgements
 from prefrl.label.formats import Which, read_judgements
 from prefrl.label.text_rows import parse
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Judged, Ranking, Rating, Response, Segment
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from prefrl.label.exchange import export, import_judgements, try_import
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
 

@@ -8,7 +8,7 @@ import pytest
 from prefrl.label.exchange import import_judgements, try_import
 from prefrl.label.formats import Layout, Row, read_judgements
 from prefrl.label.text_rows import parse
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Comparison, Rating, Response, Skip
 

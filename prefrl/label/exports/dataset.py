@@ -9,7 +9,6 @@ from typing import Any
 import sqlalchemy as sql
 import yaml
 
-from prefrl.files import whole_folder, write_file
 from prefrl.label.dataset_folders import JUDGEMENTS, OURS
 from prefrl.label.exports.given import (
     LABELER,
@@ -26,10 +25,11 @@ from prefrl.label.exports.given import (
     knows_strengths,
 )
 from prefrl.label.exports.rows import each_judgement, each_pair, margin
-from prefrl.log import StoreError
-from prefrl.projection import chunks
+from prefrl.storage.files import whole_folder, write_file
+from prefrl.storage.log import StoreError
+from prefrl.storage.projection import chunks
+from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.tables import event
 from prefrl.types import Comparison, Skip
 
 PAIRS = "preferences"

@@ -15,13 +15,13 @@ from typing import IO, Any, NamedTuple
 
 import sqlalchemy as sql
 
-from prefrl.events import load_candidate, read_answer
-from prefrl.files import make_folder, sync_folder
-from prefrl.log import StoreError
-from prefrl.projection import ANSWERS, CHUNK, all_events, chunks, words
+from prefrl.storage.events import load_candidate, read_answer
+from prefrl.storage.files import make_folder, sync_folder
+from prefrl.storage.log import StoreError
+from prefrl.storage.projection import ANSWERS, CHUNK, all_events, chunks, words
+from prefrl.storage.tables import event, standing
+from prefrl.storage.tables import query as asked
 from prefrl.store import Store
-from prefrl.tables import event, standing
-from prefrl.tables import query as asked
 from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
 
 LABELER = "annotator's name"

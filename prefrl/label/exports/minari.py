@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.files import whole_folder
 from prefrl.label.exports.given import (
     LABELER,
     ORDER,
@@ -23,7 +22,8 @@ from prefrl.label.exports.given import (
     told,
     write_lines,
 )
-from prefrl.log import StoreError
+from prefrl.storage.files import whole_folder
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Segment
 

@@ -10,7 +10,7 @@ from typing import IO, Any
 from prefrl.label.exports.given import LABELER, STRENGTH, TIME, WEIGHT, Exported, Tally, whole_file
 from prefrl.label.exports.rows import Pair, each_pair
 from prefrl.label.tables import GUARDED, guarded
-from prefrl.log import StoreError
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Skip
 

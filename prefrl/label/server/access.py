@@ -13,8 +13,8 @@ from typing import Any, Literal, TypeAlias
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl import tables
-from prefrl.log import row
+from prefrl.storage import tables
+from prefrl.storage.log import row
 
 Role: TypeAlias = Literal["annotator", "admin", "trainer"]
 State: TypeAlias = Literal["active", "paused", "revoked"]

@@ -20,7 +20,7 @@ from prefrl.label.server.security import Guard, Refused, Rules
 from prefrl.label.server.service import Service
 from prefrl.label.server.trainer import trainer_routes
 from prefrl.label.server.writer import Unavailable
-from prefrl.log import StoreError, StoreFull
+from prefrl.storage.log import StoreError, StoreFull
 
 CLIP_SECONDS = 20.0
 """How long a clip that is not drawn yet is waited for, before the page is told to ask again."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.events import read_answer
 from prefrl.label.server.ledger import best
 from prefrl.label.server.tallies import shortfall
 from prefrl.stats.intervals import Measured, share
-from prefrl.tables import assignment, event, query
+from prefrl.storage.events import read_answer
+from prefrl.storage.tables import assignment, event, query
 from prefrl.types import Skip
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 
 from prefrl.label.server import api, records
 from prefrl.label.server.questions import Given
-from prefrl.log import EventLog
+from prefrl.storage.log import EventLog
 
 REMEMBERED = 1000
 """Queries whose candidates are kept in memory."""

@@ -17,8 +17,8 @@ from prefrl.label.server.api import AgreementRow, AnnotatorRow
 from prefrl.label.server.ledger import KINDS, SKIPPED, Ledger
 from prefrl.label.server.tallies import Mask, Rows, interval
 from prefrl.stats.intervals import Measured, share
-from prefrl.tables import annotator, event
-from prefrl.tables import query as asked
+from prefrl.storage.tables import annotator, event
+from prefrl.storage.tables import query as asked
 
 ALONE = Measured(reason="nobody else judged what this person did")
 EVENT = ("seq", "id", "kind", "subject", "actor", "body", "at")

@@ -18,9 +18,9 @@ from prefrl.label.server import api, records
 from prefrl.label.server.desk import Desk
 from prefrl.label.server.questions import Given, Question
 from prefrl.label.server.security import Refused
-from prefrl.log import Transaction, row
+from prefrl.storage.log import Transaction, row
+from prefrl.storage.tables import assignment, canonical, submission
 from prefrl.store import Store
-from prefrl.tables import assignment, canonical, submission
 from prefrl.types import Answer, Comparison, Ranking, Skip
 
 REMEMBERED = 10_000

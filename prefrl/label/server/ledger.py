@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.events import ANSWER_TYPES, read_answer
 from prefrl.graph import implied_pairs
+from prefrl.storage.events import ANSWER_TYPES, read_answer
 from prefrl.types import Answer, Choice, Floats, Ranking, Rating, Skip
 
 JUDGED, SKIPPED, INCOMPARABLE = 0, 1, 2

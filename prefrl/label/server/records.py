@@ -13,8 +13,8 @@ from sqlalchemy import Connection
 from prefrl.label.server.api import HISTORY
 from prefrl.label.server.desk import REMEMBERED
 from prefrl.label.server.questions import BETWEEN, Given, Past, Question
-from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, RETRACTED, chunks
-from prefrl.tables import assignment, event, query, setting, standing
+from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, RETRACTED, chunks
+from prefrl.storage.tables import assignment, event, query, setting, standing
 
 done = query.c.judged + query.c.incomparable
 # Statements for each answer are built once: building one costs more than running it.

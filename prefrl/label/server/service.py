@@ -32,7 +32,7 @@ from prefrl.label.server.texts import (
     version_of,
 )
 from prefrl.label.server.writer import Unavailable, Writer
-from prefrl.log import Transaction, row
+from prefrl.storage.log import Transaction, row
 from prefrl.store import Store
 from prefrl.types import Query
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from prefrl.label.server.access import Event
-from prefrl.log import row
+from prefrl.storage.log import row
 
 TEXT = "consent"
 AGREED = "consent:"

@@ -14,7 +14,7 @@ from prefrl.label.server.access import Person
 from prefrl.label.server.people import errors, service_of, trainer
 from prefrl.label.server.security import Refused
 from prefrl.label.server.service import Service
-from prefrl.tables import canonical
+from prefrl.storage.tables import canonical
 
 MOST_LABELS, MOST_QUERIES = 10_000, 1000
 """In one answer."""

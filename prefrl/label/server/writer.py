@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy.exc import OperationalError
 
-from prefrl.log import EventLog, StoreFull, Transaction
+from prefrl.storage.log import EventLog, StoreFull, Transaction
 
 T = TypeVar("T")
 TOGETHER = 256

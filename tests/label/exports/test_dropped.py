@@ -13,7 +13,7 @@ import pytest
 
 from prefrl.label.exchange import EXPORTS, export
 from prefrl.label.transcripts import prompt_text
-from prefrl.log import StoreError, row
+from prefrl.storage.log import StoreError, row
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
 

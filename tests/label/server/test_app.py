@@ -14,7 +14,7 @@ from web_service import answering, ask_for, browser, invite, log_in, serving
 from prefrl.label.server.app import routes
 from prefrl.label.server.people import cookie_name
 from prefrl.label.server.service import Service
-from prefrl.log import StoreFull
+from prefrl.storage.log import StoreFull
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 

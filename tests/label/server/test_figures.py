@@ -3,7 +3,7 @@
 import pytest
 
 from prefrl.label.server.figures import Dashboard, Figures
-from prefrl.log import row
+from prefrl.storage.log import row
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response, Skip
 

@@ -14,7 +14,7 @@ import pytest
 from hostile_server import Answered, Child, receive, started
 from web_service import answering
 
-from prefrl.maintenance import verify_store
+from prefrl.storage.maintenance import verify_store
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads the memory of a process from /proc")
 GROWTH = 20 * 2**20

@@ -30,7 +30,7 @@ from prefrl.label.server.questions import Policy
 from prefrl.label.server.security import Refused
 from prefrl.label.server.service import Service
 from prefrl.label.server.terms import Terms
-from prefrl.maintenance import verify_store
+from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
 
 T = TypeVar("T")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from prefrl.label.server.writer import Unavailable, Writer
-from prefrl.log import StoreFull, Transaction, row
+from prefrl.storage.log import StoreFull, Transaction, row
 from prefrl.store import Store
 from prefrl.types import Segment
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from stores import checkpoint, derived, fill, logical, responses
 
-from prefrl.log import DamagedStore, StoreError
-from prefrl.maintenance import backup, repair_derived, salvage, verify_store
-from prefrl.projection import dump, rebuild
+from prefrl.storage.log import DamagedStore, StoreError
+from prefrl.storage.maintenance import backup, repair_derived, salvage, verify_store
+from prefrl.storage.projection import dump, rebuild
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response, Segment
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.engines import StoreError
-from prefrl.events import (
+from prefrl.storage.engines import StoreError
+from prefrl.storage.events import (
     check_answer,
     check_assignment,
     check_event,
@@ -24,8 +24,8 @@ from prefrl.events import (
     load_foreign,
     read_answer,
 )
-from prefrl.projection import ANSWERS, CHUNK, chunks
-from prefrl.tables import event
+from prefrl.storage.projection import ANSWERS, CHUNK, chunks
+from prefrl.storage.tables import event
 from prefrl.types import Answer, Comparison, Query
 
 SHOWN = 20

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from prefrl.files import DamagedError, write_file
+from prefrl.storage.files import DamagedError, write_file
 from prefrl.types import State
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from stores import checkpoint, responses
 
-from prefrl.files import write_file
-from prefrl.maintenance import verify_store
+from prefrl.storage.files import write_file
+from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
 from prefrl.types import Comparison, Response
 

@@ -52,7 +52,7 @@ meta = sql.Table(
 """`schema`: which tables these are. `head`: number and hash of the newest event."""
 version = sql.Table("alembic_version", metadata, sql.Column("version_num", sql.String(32), primary_key=True))
 
-# --- derived: `prefrl.projection` writes them, and can write them again from the log -------------------------------
+# --- derived: `prefrl.storage.projection` writes them, and can write them again from the log ---------------------
 
 query = sql.Table(
     "query",

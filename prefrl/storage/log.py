@@ -15,11 +15,11 @@ import sqlalchemy as sql
 from sqlalchemy import Connection
 from sqlalchemy.exc import DatabaseError, IntegrityError, OperationalError
 
-from prefrl import engines
-from prefrl.engines import StoreError
-from prefrl.files import write_file
-from prefrl.projection import CHUNK, all_events, chunks, project
-from prefrl.tables import SCHEMA, chained, event, meta, metadata, version
+from prefrl.storage import engines
+from prefrl.storage.engines import StoreError
+from prefrl.storage.files import write_file
+from prefrl.storage.projection import CHUNK, all_events, chunks, project
+from prefrl.storage.tables import SCHEMA, chained, event, meta, metadata, version
 
 BALLAST = 8 * 2**20
 """Bytes kept in reserve while people label: a full disk still has room to close the books."""
@@ -219,7 +219,7 @@ class EventLog:
                 connection.execute(sql.insert(version), {"version_num": str(SCHEMA)})
                 connection.execute(sql.insert(meta), {"key": "schema", "value": str(SCHEMA)})
         if there and schema_of(self._reader) < SCHEMA:
-            from prefrl.migrate import migrate
+            from prefrl.storage.migrate import migrate
 
             migrate(writer, self.folder)
 

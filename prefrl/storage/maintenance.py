@@ -14,12 +14,12 @@ import sqlalchemy as sql
 from sqlalchemy import Connection
 from sqlalchemy.exc import DatabaseError
 
-from prefrl import engines
-from prefrl.events import load_candidate
-from prefrl.files import check_free, verify, whole_folder, write_file
-from prefrl.log import StoreError, check_schema, require_store
-from prefrl.projection import KINDS, all_events, chunks, dump, project, rebuild
-from prefrl.tables import SCHEMA, chained, event, meta, metadata, version
+from prefrl.storage import engines
+from prefrl.storage.events import load_candidate
+from prefrl.storage.files import check_free, verify, whole_folder, write_file
+from prefrl.storage.log import StoreError, check_schema, require_store
+from prefrl.storage.projection import KINDS, all_events, chunks, dump, project, rebuild
+from prefrl.storage.tables import SCHEMA, chained, event, meta, metadata, version
 
 SHOWN = 20
 """How many faults are told."""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from prefrl.files import make_folder, sync_folder
-from prefrl.projection import rebuild
+from prefrl.storage.files import make_folder, sync_folder
+from prefrl.storage.projection import rebuild
 
 
 def migrate(writer: sql.Engine, folder: Path) -> None:
@@ -23,7 +23,7 @@ def migrate(writer: sql.Engine, folder: Path) -> None:
 
     with writer.begin() as connection:
         config = Config(attributes={"connection": connection})
-        config.set_main_option("script_location", str(files("prefrl") / "migrations"))
+        config.set_main_option("script_location", str(files("prefrl.storage") / "migrations"))
         if not sql.inspect(connection).has_table("alembic_version"):
             command.stamp(config, "1")
         command.upgrade(config, "head")

@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sql
 from filelock import FileLock, Timeout
 
-from prefrl.files import write_file
+from prefrl.storage.files import write_file
 
 NETWORK = ("nfs", "cifs", "smb", "9p", "fuse.sshfs", "afs", "ceph", "glusterfs")
 """File systems on which SQLite's write-ahead log is not safe: its shared memory does not cross machines."""

@@ -13,7 +13,18 @@ import sqlalchemy as sql
 from sqlalchemy import Connection
 from sqlalchemy.dialects import postgresql, sqlite
 
-from prefrl.tables import DERIVED, annotator, assignment, canonical, event, query, setting, standing, submission, token
+from prefrl.storage.tables import (
+    DERIVED,
+    annotator,
+    assignment,
+    canonical,
+    event,
+    query,
+    setting,
+    standing,
+    submission,
+    token,
+)
 
 JUDGEMENTS = ("comparison", "ranking", "choice", "rating")
 ANSWERS = (*JUDGEMENTS, "skip")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from prefrl.checkpoints import load_state, save_state
-from prefrl.files import DamagedError
+from prefrl.storage.checkpoints import load_state, save_state
+from prefrl.storage.files import DamagedError
 from prefrl.types import State
 
 

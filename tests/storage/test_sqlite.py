@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from prefrl.log import StoreError, StoreFull
-from prefrl.maintenance import verify_store
+from prefrl.storage.log import StoreError, StoreFull
+from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response, Segment
 

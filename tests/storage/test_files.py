@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from prefrl.files import DamagedError, read_lines, verify, whole_folder, write_file
+from prefrl.storage.files import DamagedError, read_lines, verify, whole_folder, write_file
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import sqlalchemy as sql
 from sqlalchemy.exc import DBAPIError
 from stores import derived, fill, responses
 
-from prefrl.log import DamagedStore, StoreError
-from prefrl.maintenance import backup, repair_derived, verify_store
+from prefrl.storage.log import DamagedStore, StoreError
+from prefrl.storage.maintenance import backup, repair_derived, verify_store
+from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.tables import event
 from prefrl.types import Comparison, Response
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from prefrl.files import DamagedError, write_file
+from prefrl.storage.files import DamagedError, write_file
 from prefrl.types import Floats
 
 

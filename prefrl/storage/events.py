@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.blobs import read_arrays
-from prefrl.engines import StoreError
 from prefrl.numeric import is_whole
-from prefrl.projection import ANSWERS
+from prefrl.storage.blobs import read_arrays
+from prefrl.storage.engines import StoreError
+from prefrl.storage.projection import ANSWERS
 from prefrl.types import (
     Answer,
     Candidate,
