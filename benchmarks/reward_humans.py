@@ -35,9 +35,9 @@ from torch import Tensor
 
 from prefrl.config import Config
 from prefrl.fit.metrics import accuracy
+from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.graph import batch
 from prefrl.label.formats import Which, read_judgements
 from prefrl.types import Comparison, Judged, Query, Ranking
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from prefrl.graph import Batch
+from prefrl.fit.pairs import Batch
 from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
 
 if TYPE_CHECKING:

@@ -30,10 +30,10 @@ from prefrl.evaluate.invariance import self_test
 from prefrl.evaluate.lengths import context, length, length_part, sample
 from prefrl.evaluate.summary import read_metrics
 from prefrl.fit.metrics import Answering, brier, calibration_error, log_losses, temperature
+from prefrl.fit.pairs import compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import split
 from prefrl.fit.terms import Ties
-from prefrl.graph import compared
 from prefrl.protocols import RewardModel, Store
 from prefrl.storage.files import DamagedError
 from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score, person

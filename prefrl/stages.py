@@ -17,9 +17,9 @@ from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.report import render_card
 from prefrl.evaluate.summary import read_metrics
+from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
-from prefrl.graph import batch
 from prefrl.label.formats import Which
 from prefrl.label.source import open_judgements
 from prefrl.protocols import Attended

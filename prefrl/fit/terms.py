@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.graph import implied_pairs
+from prefrl.fit.pairs import implied_pairs
 from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating, person
 
 Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]

@@ -13,10 +13,10 @@ from prefrl.fit.descent import Problem, all_scores, ensemble_loss, optimise, tra
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.losses import preference_logits
 from prefrl.fit.metrics import accuracy, brier, calibration_error, temperature
+from prefrl.fit.pairs import Batch, compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
-from prefrl.graph import Batch, compared
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import C, Fitted, Floats, Judged, Metrics
 

@@ -8,9 +8,9 @@ import torch
 from scipy.stats import pearsonr
 
 from prefrl.components import ConfigError, settings_class
+from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
-from prefrl.graph import batch
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment

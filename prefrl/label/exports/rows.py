@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from prefrl.graph import implied_pairs
+from prefrl.fit.pairs import implied_pairs
 from prefrl.label.exports.given import (
     LABELER,
     ORDER,

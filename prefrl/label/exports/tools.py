@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from prefrl.graph import implied_pairs
+from prefrl.fit.pairs import implied_pairs
 from prefrl.label.exports.given import (
     LABELER,
     TIME,

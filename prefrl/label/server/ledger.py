@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.graph import implied_pairs
+from prefrl.fit.pairs import implied_pairs
 from prefrl.storage.events import ANSWER_TYPES, read_answer
 from prefrl.types import Answer, Choice, Floats, Ranking, Rating, Skip
 

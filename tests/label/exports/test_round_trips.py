@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from prefrl.graph import implied_pairs
+from prefrl.fit.pairs import implied_pairs
 from prefrl.label.exchange import export, import_judgements
 from prefrl.label.transcripts import prompt_text
 from prefrl.store import Store

@@ -1,6 +1,6 @@
 import numpy as np
 
-from prefrl.graph import batch, compared, implied_pairs
+from prefrl.fit.pairs import batch, compared, implied_pairs
 from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response
 
 
