@@ -34,11 +34,11 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from prefrl.config import Config
+from prefrl.exchange.formats import Which, read_judgements
 from prefrl.fit.metrics import accuracy
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.label.formats import Which, read_judgements
 from prefrl.types import Comparison, Judged, Query, Ranking
 
 HELD_OUT, WORDS = 0.25, 1024

@@ -23,7 +23,7 @@ from transformers import (
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.cloning import make_tokenizer
 from prefrl.envs.text import for_evaluation
-from prefrl.label.formats import read_judgements
+from prefrl.exchange.formats import read_judgements
 from prefrl.types import Floats, Response
 
 ONLY_BYTES = 259

@@ -132,7 +132,7 @@ def fit(
     """Fit a reward model on judgements, and save it."""
     from prefrl import stages
     from prefrl.console import console, metrics_table, say
-    from prefrl.label.formats import Which
+    from prefrl.exchange.formats import Which
 
     settings = _load(stages.config_of(source, config), overrides)
     fitted, notes = stages.fit_reward(settings, source, out, Which.of(labelers, split))
@@ -180,7 +180,7 @@ def evaluate(
     """Evaluate the newest policy of a run, or grade a reward model."""
     from prefrl import stages
     from prefrl.console import card_table, console, metrics_table
-    from prefrl.label.formats import Which
+    from prefrl.exchange.formats import Which
 
     if reward is not None:
         card = stages.report_card(reward, data, held_out, rewardbench, Which.of(labelers, split))

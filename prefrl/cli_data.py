@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from prefrl.label.exchange import Imported
-    from prefrl.label.formats import Layout, Which
+    from prefrl.exchange.formats import Layout, Which
+    from prefrl.exchange.ports import Imported
     from prefrl.store import Store
 
 commands = typer.Typer()
@@ -84,7 +84,7 @@ def export_(
 
         say(f"{to}: its logit, shifted by {export_classifier(store, to):+.6g}, is the mean of the reward's members")
         return
-    from prefrl.label.exchange import export
+    from prefrl.exchange.ports import export
     from prefrl.store import Store
 
     with Store[Any](store, write=False) as opened:
@@ -111,7 +111,7 @@ def import_(
 ) -> None:
     """Read judgements from files into a store, all or none."""
     from prefrl.console import say
-    from prefrl.label.formats import Layout, Which
+    from prefrl.exchange.formats import Layout, Which
 
     layout = Layout.of(form.value, map_, skip_bad)
     done = (_try if dry_run else _import)(path, out, Which.of(labelers, split), layout)
@@ -123,14 +123,14 @@ def import_(
 
 
 def _import(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
-    from prefrl.label.exchange import import_judgements
+    from prefrl.exchange.ports import import_judgements
 
     with _store(out) as store:
         return import_judgements(path, store, which, layout)
 
 
 def _try(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
-    from prefrl.label.exchange import try_import
+    from prefrl.exchange.ports import try_import
     from prefrl.storage.log import has_store
     from prefrl.store import Store
 

@@ -17,11 +17,11 @@ from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.report import render_card
 from prefrl.evaluate.summary import read_metrics
+from prefrl.exchange.formats import Which
+from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
-from prefrl.label.formats import Which
-from prefrl.label.source import open_judgements
 from prefrl.protocols import Attended
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams

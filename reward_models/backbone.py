@@ -23,7 +23,7 @@ from transformers.utils.logging import (
 )
 
 from prefrl.components import ConfigError
-from prefrl.label.transcripts import prompt_messages, response_messages
+from prefrl.exchange.transcripts import prompt_messages, response_messages
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
 from prefrl.types import Response

@@ -7,8 +7,8 @@ import pytest
 
 from prefrl.cli import main
 from prefrl.cli_data import Form, Rows
-from prefrl.label.exchange import EXPORTS
-from prefrl.label.text_rows import FORMS
+from prefrl.exchange.ports import EXPORTS
+from prefrl.exchange.text_rows import FORMS
 from prefrl.store import Store
 from prefrl.types import Response
 

@@ -13,9 +13,9 @@ import yaml
 from prefrl import Config
 from prefrl.config import presets
 from prefrl.envs.texts import Texts, TextsSettings
+from prefrl.exchange.formats import Which
+from prefrl.exchange.source import open_judgements
 from prefrl.fit.trainer import NothingToFit
-from prefrl.label.formats import Which
-from prefrl.label.source import open_judgements
 from prefrl.stages import fit_reward, shrink
 from prefrl.store import Store
 from prefrl.types import Query, Ranking, Response, Segment

@@ -13,7 +13,7 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
-from prefrl.label.exports.given import Exported
+from prefrl.exchange.exports.given import Exported
 from prefrl.label.server import api
 from prefrl.label.server.access import Person
 from prefrl.label.server.overview import Health, Link, Overview
@@ -128,7 +128,7 @@ def _overview(served: Service) -> Overview:
 
 def _export(served: Service, name: str) -> tuple[Path, Exported]:
     """Write an export into a temporary folder of its own, from a store that is only read; folders are zipped."""
-    from prefrl.label.exchange import export
+    from prefrl.exchange.ports import export
 
     folder = Path(tempfile.mkdtemp(prefix="prefrl-export-"))
     path = folder / f"{name}{EXPORTS[served.terms.page.kind][name]}"

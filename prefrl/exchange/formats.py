@@ -1,0 +1,259 @@
+"""Files of judgements, read whole or not at all: judged responses to prompts, and judged pairs of segments.
+
+A file is read twice: once to find every mistake, and once for its judgements, so that none of it need be kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from prefrl.exchange.reading import TABLES, list_files
+from prefrl.types import Answer, Judged, Query, Skip, person
+
+SHOWN_ERRORS = 20
+SHOWN_REPEATS = 5
+HUMAN, SCRIPT = "human", "script"
+
+
+class Row(NamedTuple):
+    """One answer of a file."""
+
+    query: Query[Any]
+    answer: Answer
+    """Its labeler is "" where the file names none."""
+    split: str = ""
+    """The part of the data that the file puts it into; "" where it says nothing."""
+    named: str = ""
+    """The query of a store that it was written from; "" where the file names none."""
+    there: str = ""
+    """Its labeler, numbered among the answers to the query that is named."""
+
+    @property
+    def judged(self) -> Judged[Any]:
+        """The judgement; for rows that are no skip."""
+        if isinstance(self.answer, Skip):
+            raise ValueError("a skip is no judgement")
+        return Judged(self.query, self.answer)
+
+
+Parts: TypeAlias = Iterable[tuple[str, Callable[[], Sequence[Row | str]]]]
+"""(place, parse): where a part of a file stands, and what reads it: answers, and reasons for leaving some out."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the rows of a file are to be read."""
+
+    form: str = "auto"
+    """Which of `text_rows.FORMS` they have; "auto" looks at each row's columns."""
+    columns: tuple[tuple[str, str], ...] = ()
+    """(ours, the file's): which of its columns are to be read as what; when given, nothing else is read."""
+    skip_bad: bool = False
+    """Leave bad rows out, and tell of them, instead of refusing the file."""
+
+    @classmethod
+    def of(cls, form: str = "auto", columns: str = "", skip_bad: bool = False) -> Layout:
+        """From names as `prompt=question,chosen=better,rejected=worse`."""
+        pairs = [pair.partition("=") for pair in columns.split(",") if pair.strip()]
+        if bad := ["".join(pair) for pair in pairs if not (pair[0].strip() and pair[2].strip())]:
+            raise ValueError(f"expected columns as prompt=question,chosen=better, got {bad[0]!r}")
+        return cls(form, tuple((ours.strip(), theirs.strip()) for ours, _, theirs in pairs), skip_bad)
+
+
+@dataclass(frozen=True)
+class Which:
+    """Which judgements of a source count."""
+
+    labelers: tuple[str, ...] = ()
+    """By whom; everybody when empty."""
+    split: str = ""
+    """Of which part of a file, "train" or "eval" say; all when empty."""
+
+    @classmethod
+    def of(cls, labelers: str, split: str) -> Which:
+        """From names that are separated by commas."""
+        return cls(tuple(name.strip() for name in labelers.split(",") if name.strip()), split)
+
+    def takes(self, labeler: str) -> bool:
+        """Whether a labeler's judgements count; "human#2" gave the second judgement of "human" on the same query."""
+        return not self.labelers or person(labeler) in self.labelers
+
+
+@dataclass(frozen=True)
+class Read:
+    """What a file holds."""
+
+    judged: tuple[Judged[Any], ...]
+    notes: tuple[str, ...] = ()
+    """What was left out, for people."""
+
+
+def read_judgements(path: Path, which: Which | None = None, layout: Layout | None = None) -> Read:
+    """The judgements in a file of JSON lines (.gz or not), in a table (.csv, .parquet) or in an .npz of segment pairs.
+
+    All or none: raises `ValueError` with the place of each mistake (the first 20), also in parts that `which` leaves
+    out. A query that is judged again is another judgement, by "NAME#2": contradictions are kept, not resolved. Where a
+    file names no labeler it is called after the content, so that reading it twice changes nothing. Labels of a
+    "script" beside a human's are left out, and said to be, unless `which` asks for them.
+    """
+    checked = check_file(path, which, layout)
+    return Read(tuple(row.judged for row in checked.rows() if not isinstance(row.answer, Skip)), checked.notes)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A file, or a folder of files, that was read through, and found whole."""
+
+    path: Path
+    which: Which
+    layout: Layout
+    default: str
+    """Whom its judgements are by where it names nobody."""
+    notes: tuple[str, ...]
+
+    def rows(self) -> Iterator[Row]:
+        """The answers that count, each with a labeler; read from the file again."""
+        seen: Counter[bytes] = Counter()
+        for _, parse in _parts(self.path, self.layout):
+            try:
+                found = parse()
+            except ValueError:
+                if not self.layout.skip_bad:
+                    raise
+                continue
+            for row in (_numbered(one, self.default, seen) for one in found if isinstance(one, Row)):
+                if self.which.takes(row.answer.labeler) and self.which.split in ("", row.split):
+                    yield row
+
+
+def check_file(path: Path, which: Which | None = None, layout: Layout | None = None) -> Checked:
+    """Read through a file, or a folder of files, keeping none of it; raises as `read_judgements` does."""
+    layout, which, found = layout or Layout(), which or Which(), _Found(f"file:{_digest(path)}")
+    for place, parse in _parts(path, layout):
+        try:
+            parsed = parse()
+        except ValueError as error:
+            found.mistake(f"{place}: {error}")
+        else:
+            found.take(place, parsed)
+    notes = found.told(path, layout.skip_bad)
+    labelers = {person(who) for who, _ in found.counts}
+    if not which.labelers and {HUMAN, SCRIPT} <= labelers:
+        which = replace(which, labelers=tuple(labelers - {SCRIPT}))
+        scripted = sum(
+            n for (who, split), n in found.counts.items() if person(who) == SCRIPT and which.split in ("", split)
+        )
+        notes += _told(Counter({"label by a script (--labelers script reads it)": scripted}))
+    if not any(which.takes(who) and which.split in ("", split) for who, split in found.counts):
+        raise ValueError(f"{path}: {_nothing(found.counts, which)}")
+    return Checked(path, which, layout, found.default, notes)
+
+
+@dataclass
+class _Found:
+    """What a first reading of a file comes to: counts, and a few bytes for each row."""
+
+    default: str
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """(labeler, split) -> answers."""
+    left_out: Counter[str] = field(default_factory=Counter)
+    errors: list[str] = field(default_factory=list)
+    mistakes: int = 0
+    seen: Counter[bytes] = field(default_factory=Counter)
+    first: dict[bytes, str] = field(default_factory=dict)
+    """Where a labeler first judged a query."""
+    repeats: list[str] = field(default_factory=list)
+    repeated: int = 0
+
+    def mistake(self, error: str) -> None:
+        self.mistakes += 1
+        self.errors += [error] * (len(self.errors) < SHOWN_ERRORS)
+
+    def take(self, place: str, parsed: Sequence[Row | str]) -> None:
+        self.left_out.update(one for one in parsed if isinstance(one, str))
+        for row in (one for one in parsed if isinstance(one, Row)):
+            self.counts[row.answer.labeler or self.default, row.split] += 1
+            key = _key(row, self.default)
+            self.seen[key] += 1
+            if self.seen[key] > 1:
+                self.repeated += 1
+                self.repeats += [f"{place} repeats {self.first[key]}"] * (len(self.repeats) < SHOWN_REPEATS)
+            self.first.setdefault(key, place)
+
+    def told(self, path: Path, skip_bad: bool) -> tuple[str, ...]:
+        """Notes for people. Raises `ValueError` for mistakes that may not be left out, and where nothing was found."""
+        more = f"\n... and {self.mistakes - SHOWN_ERRORS} more" if self.mistakes > SHOWN_ERRORS else ""
+        listed = "\n".join(self.errors) + more
+        if self.mistakes and not skip_bad:
+            raise ValueError(f"{path}: nothing was read\n{listed}")
+        notes = _told(self.left_out)
+        if self.mistakes:
+            notes += (f"left out: {self.mistakes} x bad row\n{listed}",)
+        if self.repeated:
+            shown = "; ".join(self.repeats) + ("; ..." if self.repeated > SHOWN_REPEATS else "")
+            again = "another judgement of the same query by the same labeler, kept as NAME#2"
+            notes += (f"{self.repeated} x {again}: {shown}",)
+        if not self.counts:
+            reasons = "".join(f"; {note}" for note in notes)
+            raise ValueError(f"{path}: expected at least one row with a judgement, got none{reasons}")
+        return notes
+
+
+def _parts(path: Path, layout: Layout) -> Parts:
+    if path.suffix == ".npz":
+        from prefrl.exchange.segment_pairs import segment_pairs
+
+        return segment_pairs(path)
+    if path.is_dir():
+        from prefrl.exchange.dataset_folders import folder_rows
+        from prefrl.exchange.minari_folders import is_minari, minari_rows
+
+        return minari_rows(path) if is_minari(path) else folder_rows(path, layout)
+    from prefrl.exchange.text_rows import text_rows
+
+    return text_rows(path, layout)
+
+
+def _digest(path: Path) -> str:
+    if path.is_dir():
+        files = list_files(path, [f"*{suffix}*" for suffix in (*TABLES, ".json")])
+        return hashlib.sha256("".join(_digest(file) for file in files).encode()).hexdigest()[:12]
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]
+
+
+def _key(row: Row, default: str) -> bytes:
+    return _digested(f"{row.query.id}:{row.answer.labeler or default}")
+
+
+def _digested(text: str) -> bytes:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()
+
+
+def _numbered(row: Row, default: str, seen: Counter[bytes]) -> Row:
+    """A row with a labeler; one's second judgement of a query is by "NAME#2": a store keeps one a name."""
+    who = row.answer.labeler or default
+    there = _name(who, _digested(f"{row.named} {who}"), seen) if row.named else ""
+    return row._replace(answer=replace(row.answer, labeler=_name(who, _key(row, default), seen)), there=there)
+
+
+def _name(who: str, key: bytes, seen: Counter[bytes]) -> str:
+    seen[key] += 1
+    return f"{who}#{seen[key]}" if seen[key] > 1 else who
+
+
+def _nothing(counts: Iterable[tuple[str, str]], which: Which) -> str:
+    """Why nothing was chosen, and what there is to choose from."""
+    wanted = " and ".join([*which.labelers, *([f"split {which.split!r}"] if which.split else [])])
+    labelers = ", ".join(sorted({person(who) for who, _ in counts}))
+    splits = ", ".join(sorted({split for _, split in counts} - {""})) or "none"
+    return f"no judgement by or in {wanted}; labelers there: {labelers}; splits there: {splits}"
+
+
+def _told(left_out: Counter[str]) -> tuple[str, ...]:
+    return tuple(f"left out: {count} x {reason}" for reason, count in left_out.items())

@@ -1,0 +1,81 @@
+"""Judgements ready to be read, wherever they lie: in the store of a folder, or in a file."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from prefrl.exchange.formats import Which
+from prefrl.exchange.ports import import_judgements
+from prefrl.storage.projection import ANSWERS
+from prefrl.store import Store
+from prefrl.types import Judged, Segment, person
+
+
+class Opened(NamedTuple):
+    """Judgements, ready to be read."""
+
+    store: Store[Any]
+    notes: tuple[str, ...]
+    """What was left out of a file, for people."""
+
+
+@contextmanager
+def open_judgements(source: Path, task: Any, which: Which | None = None) -> Iterator[Opened]:
+    """The store of a folder, or a temporary one with the judgements of a file; to be read only.
+
+    `which` leaves out the other labelers' judgements, and the other parts of a file. Raises `ValueError` where nothing
+    is left, or where candidates do not fit the task.
+    """
+    with ExitStack() as stack:
+        if source.is_dir() and not (which and (which.labelers or which.split)):
+            opened = Opened(stack.enter_context(Store[Any](source, write=False)), ())
+        else:
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            opened = _chosen(source, stack.enter_context(Store[Any](scratch)), which)
+        check_candidates(opened.store.judged(), task)
+        yield opened
+
+
+def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
+    """Fill an empty store with what is chosen of a folder's store or of a file."""
+    if which is None or not source.is_dir():
+        return Opened(store, import_judgements(source, store, which).notes)
+    if which.split:
+        raise ValueError(f"{source} is a store, which knows no split: give a file, or leave the split out")
+    with Store[Any](source, write=False) as whole:
+        names = {e["actor"] for e in whole.events() if e["kind"] in ANSWERS}
+        if not any(map(which.takes, names)):
+            known = ", ".join(sorted(set(map(person, names)) - {""})) or "none"
+            raise ValueError(f"{source}: no judgement by {', '.join(which.labelers)}; labelers there: {known}")
+        store.merge(lambda: _events(whole, which), source / "blobs")
+    return Opened(store, ())
+
+
+def _events(store: Store[Any], which: Which) -> Iterator[dict[str, Any]]:
+    """What was asked, and what those have said of it who are wanted."""
+    for one in store.events():
+        said = one["kind"] in (*ANSWERS, "retract") and which.takes(one["actor"])
+        if said or one["kind"] in ("candidate", "query"):
+            yield one
+
+
+def check_candidates(judged: Sequence[Judged[Any]], task: Any) -> None:
+    """Raise `ValueError` unless all candidates are of the task's kind, and segments of its sizes."""
+    for candidate in (c for one in judged for c in one.query.candidates):
+        control = isinstance(candidate, Segment)
+        if control != (task.kind == "control"):
+            raise ValueError(
+                f"the judgements are of {'segments' if control else 'responses'}, but {task.name} is a task of "
+                f"kind {task.kind!r}: choose another config"
+            )
+        if isinstance(candidate, Segment):
+            sizes = (candidate.observations.shape[1], candidate.actions.shape[1])
+            if sizes != (expected := (task.observation_size, task.action_size)):
+                raise ValueError(
+                    f"segment {candidate.id[:12]} has observations and actions of {sizes} numbers a step, but "
+                    f"{task.name} has {expected}: choose another config"
+                )
