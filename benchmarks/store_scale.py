@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.label.server import api
-from prefrl.label.server.questions import Policy
-from prefrl.label.server.service import Service
-from prefrl.label.server.terms import Terms
+from prefrl.page import api
+from prefrl.page.questions import Policy
+from prefrl.page.service import Service
+from prefrl.page.terms import Terms
 from prefrl.storage.log import row
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response

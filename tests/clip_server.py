@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from prefrl.label.server.clips import Clips, ClipSettings
+from prefrl.page.clips.queue import Clips, ClipSettings
 
-FAKE = Path(__file__).parent / "label" / "server" / "fake_drawer.py"
+FAKE = Path(__file__).parent / "page" / "clips" / "fake_drawer.py"
 CONFIG = "task: {kind: point, segment_steps: 5, frame_size: 33}\n"
 BYTES = 25
 """Of a clip by the fake drawer."""

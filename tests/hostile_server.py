@@ -127,8 +127,8 @@ def serve(folder: Path) -> None:
     """Serve until the input ends; everything that can be logged is."""
     from stores import responses
 
-    from prefrl.label.server.site import open_site
     from prefrl.label.web import WebLabeler, WebSettings
+    from prefrl.page.site import open_site
     from prefrl.store import Store
 
     resource.setrlimit(resource.RLIMIT_NOFILE, (FILES, FILES))

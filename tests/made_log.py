@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.label.server import tallies
-from prefrl.label.server.api import AgreementRow
-from prefrl.label.server.ledger import Ledger
+from prefrl.page import tallies
+from prefrl.page.api import AgreementRow
+from prefrl.page.ledger import Ledger
 from prefrl.stats.intervals import Measured
 from prefrl.storage.log import row
 

@@ -15,7 +15,7 @@ from prefrl.schema import schema, text
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = (".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed")
-PAGES = "prefrl/label/server/pages"
+PAGES = "prefrl/page"
 
 
 def test_the_shipped_schema_is_up_to_date() -> None:

@@ -14,12 +14,12 @@ from rich.console import Console
 
 from prefrl.components import ConfigError, Settings, missing
 from prefrl.label.checks import pick_checks
-from prefrl.label.server.clips import ClipSettings
+from prefrl.page.clips.queue import ClipSettings
 from prefrl.protocols import Store, Task
 from prefrl.types import C
 
 if TYPE_CHECKING:  # a run without people loads no web server
-    from prefrl.label.server.site import Site
+    from prefrl.page.site import Site
 
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
@@ -98,7 +98,7 @@ class WebSettings(Settings):
     @field_validator("name")
     @classmethod
     def _can_be_a_name(cls, name: str) -> str:
-        from prefrl.label.server.access import check_name
+        from prefrl.page.access import check_name
 
         return check_name(name)
 
@@ -150,7 +150,7 @@ class WebLabeler:
         """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
         self.fixed = fixed
         try:
-            from prefrl.label.server.site import open_site
+            from prefrl.page.site import open_site
         except ModuleNotFoundError as error:
             raise ConfigError(f"labeler kind 'web': {missing(error)}") from error
         self._site = open_site(self, store)

@@ -14,7 +14,7 @@ from browser.house import House, Open, clips, copy, fill, serving, texts
 from browser.visitor import Visit, Visitor, enter
 from playwright.sync_api import Browser, sync_playwright
 
-from prefrl.label.server.clips import Clips, ClipSettings
+from prefrl.page.clips.queue import Clips, ClipSettings
 
 PLACES = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
 FLAGS = (

@@ -14,9 +14,9 @@ import numpy as np
 import sqlalchemy as sql
 
 from prefrl.envs.toys import PointSettings
-from prefrl.label.server.service import Service
-from prefrl.label.server.site import Site
 from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.page.service import Service
+from prefrl.page.site import Site
 from prefrl.storage import tables
 from prefrl.store import Store
 from prefrl.types import Answer, Comparison, Query, Response, Segment

@@ -19,9 +19,9 @@ from starlette.testclient import TestClient
 from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
-from prefrl.label.server import serve
-from prefrl.label.server.site import hosts, warnings
 from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.page import serve
+from prefrl.page.site import hosts, warnings
 from prefrl.protocols import Attended
 from prefrl.rundir import Run, RunError
 from prefrl.stages import label
