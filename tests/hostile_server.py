@@ -127,8 +127,8 @@ def serve(folder: Path) -> None:
     """Serve until the input ends; everything that can be logged is."""
     from stores import responses
 
-    from prefrl.label.web import WebLabeler, WebSettings
-    from prefrl.page.site import open_site
+    from prefrl.label.web import WebSettings, terms_of
+    from prefrl.page.site import Address, open_site
     from prefrl.store import Store
 
     resource.setrlimit(resource.RLIMIT_NOFILE, (FILES, FILES))
@@ -136,7 +136,8 @@ def serve(folder: Path) -> None:
     settings = WebSettings(port=0, name="boss", requests_per_second=1e6, check_share=0, repeat_share=0)
     with Store[Any](folder) as store:
         store.ask(responses(200))
-        site = open_site(WebLabeler(settings, cast(Any, Texts())), store)
+        terms = terms_of(settings, cast(Any, Texts()), fixed=False)
+        site = open_site(store, terms, Address(port=0), settings.name, clips=None)
         told: dict[str, Any] = {"port": int(site.address.rstrip("/").rpartition(":")[2])}
         told["boss"] = site.notes[0].partition("#")[2]
         for name, role in (("ann", "annotator"), ("ben", "annotator"), ("trainer", "trainer")):

@@ -14,13 +14,17 @@ from rich.console import Console
 
 from prefrl.components import ConfigError, Settings, missing
 from prefrl.label.checks import pick_checks
+from prefrl.page import api, static_files
 from prefrl.page.clips.queue import ClipSettings
-from prefrl.protocols import Store, Task
+from prefrl.page.questions import Policy
+from prefrl.page.terms import Terms
+from prefrl.protocols import ControlTask, Store, Task
 from prefrl.types import C
 
 if TYPE_CHECKING:  # a run without people loads no web server
     from prefrl.page.site import Site
 
+QUESTIONS = {"control": "Which clip is better?", "text": "Which response is better?"}
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
 LOOKED_AT = {"control": 250, "text": 1000}
@@ -150,10 +154,13 @@ class WebLabeler:
         """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
         self.fixed = fixed
         try:
-            from prefrl.page.site import open_site
+            from prefrl.page.site import Address, open_site
         except ModuleNotFoundError as error:
             raise ConfigError(f"labeler kind 'web': {missing(error)}") from error
-        self._site = open_site(self, store)
+        settings = self.settings
+        place = Address(settings.host, settings.port, settings.allowed_hosts, settings.tls_cert, settings.tls_key)
+        clips = settings.clips if self.task.kind == "control" else None
+        self._site = open_site(store, terms_of(settings, self.task, fixed), place, settings.name, clips)
         return self._site.notes
 
     def close(self) -> None:
@@ -204,3 +211,32 @@ class WebLabeler:
         chosen = pick_checks(store, looked_at, count, rng)
         if chosen.queries:
             cast(Any, store).ask(chosen.queries, purpose="check", expected=chosen.expected)
+
+
+def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
+    """What a project asks and how, from its settings. `fixed`: no more will be asked than the store holds."""
+    clips = task.kind == "control"
+    page = api.Page(
+        title=task.name,
+        question=settings.question or QUESTIONS[task.kind],
+        kind=cast(Literal["control", "text"], task.kind),
+        strength=settings.strength,
+        markdown=settings.markdown,
+        minimum_watched=settings.minimum_watched if clips else 0.0,
+        break_minutes=settings.break_minutes,
+        ui_version=static_files.ui_version(static_files.static_files()),
+    )
+    lease = settings.lease_seconds or (120.0 if clips else 600.0)
+    policy = Policy(settings.overlap, lease, settings.check_share, settings.repeat_share, settings.seed)
+    return Terms(
+        page=page,
+        policy=policy,
+        strengths=dict(settings.strengths),
+        guideline=settings.guideline,
+        consent=settings.consent,
+        fps=cast(ControlTask, task).fps if clips else 0.0,
+        fixed=fixed and not settings.stay_open,
+        check_warn=settings.check_warn,
+        check_pause=settings.check_pause,
+        rate=settings.requests_per_second,
+    )

@@ -1,4 +1,4 @@
-"""A page that is being served: everything that `WebLabeler` opens and closes."""
+"""A page that is being served: everything that is opened and closed with it."""
 
 from __future__ import annotations
 
@@ -6,30 +6,61 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, cast
+from pathlib import Path
+from typing import Any
 
 from prefrl.components import ConfigError
-from prefrl.page import api, records
-from prefrl.page import static_files as pages
+from prefrl.page import records
 from prefrl.page.app import create_app
-from prefrl.page.clips.queue import Clips
-from prefrl.page.questions import Policy
+from prefrl.page.clips.queue import Clips, ClipSettings
 from prefrl.page.security import LOOPBACK, Rules
 from prefrl.page.serve import WebServer, check_tls
 from prefrl.page.service import Service
 from prefrl.page.terms import Terms
-from prefrl.protocols import ControlTask
 from prefrl.store import Store
 
-if TYPE_CHECKING:
-    from prefrl.label.web import WebLabeler
-
-QUESTIONS = {"control": "Which clip is better?", "text": "Which response is better?"}
 GOODBYE_SECONDS = 2.5
 """A little longer than a page waits before it asks how things stand."""
 SPARING = 50.0
 """Times as long as a look at all questions took is waited before the next."""
 EVERYWHERE = ("0.0.0.0", "::")
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a page is served, and under which names people reach it."""
+
+    host: str = "127.0.0.1"
+    port: int = 8900
+    """0 takes any free one."""
+    allowed_hosts: tuple[str, ...] = ()
+    """Other names than the host's own."""
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+
+    def url(self, port: int) -> str:
+        """The address that people open, at the port that was taken."""
+        host = "127.0.0.1" if self.host in EVERYWHERE else self.host
+        name = f"[{host}]" if ":" in host else host
+        return f"{'https' if self.tls_cert else 'http'}://{name}:{port}/"
+
+    def names(self) -> set[str]:
+        """The names under which the page may be reached."""
+        host = self.host.lower()
+        own = set() if host in EVERYWHERE else {f"[{host}]" if ":" in host else host}
+        return {*LOOPBACK, *own, *(name.lower() for name in self.allowed_hosts)}
+
+    def warnings(self) -> list[str]:
+        """What is open to others, and should be known to be."""
+        found = []
+        if self.host not in ("127.0.0.1", "localhost", "::1") and self.tls_cert is None:
+            found.append(
+                f"the page is served on {self.host} without TLS: everybody on the way can read along, and take links; "
+                "set labeler.tls_cert and labeler.tls_key, or keep to a network that you trust"
+            )
+        if self.host in EVERYWHERE and not self.allowed_hosts:
+            found.append("people reach the page only by names in labeler.allowed_hosts, and there are none")
+        return found
 
 
 @dataclass
@@ -106,82 +137,28 @@ class Site:
         self._pause = SPARING * (time.thread_time() - begin)
 
 
-def open_site(labeler: WebLabeler, store: Store[Any]) -> Site:
-    """Open the service, and serve it. Raises `ConfigError` where the address is taken."""
-    settings = labeler.settings
-    tls = check_tls(settings.tls_cert, settings.tls_key)
+def open_site(store: Store[Any], terms: Terms, address: Address, name: str, clips: ClipSettings | None) -> Site:
+    """Open the service, and serve it. Raises `ConfigError` where the address is taken.
+
+    `name`: the admin whose link is printed. `clips`: how clips are drawn, None where candidates need none.
+    """
+    tls = check_tls(address.tls_cert, address.tls_key)
     store.log.reserve()
-    clips = Clips(store.folder, settings.clips) if labeler.task.kind == "control" else None
-    service = Service(store, terms_of(labeler), clips)
-    server = WebServer(create_app(service, Rules(frozenset(hosts(labeler)))), tls)
+    drawn = Clips(store.folder, clips) if clips is not None else None
+    service = Service(store, terms, drawn)
+    server = WebServer(create_app(service, Rules(frozenset(address.names()))), tls)
     service.open()
-    site = Site(service, clips, server)
+    site = Site(service, drawn, server)
     try:
-        port = server.start(settings.host, settings.port)
-        if clips is not None:
-            clips.start()
-        host = "127.0.0.1" if settings.host in EVERYWHERE else settings.host
-        name = f"[{host}]" if ":" in host else host
-        site.address = f"{'https' if tls else 'http'}://{name}:{port}/"
-        site.notes = [
-            f"label here: {site.address}#{_invite(service, settings.name)}",
-            *service.notes,
-            *warnings(labeler),
-        ]
+        port = server.start(address.host, address.port)
+        if drawn is not None:
+            drawn.start()
+        site.address = address.url(port)
+        site.notes = [f"label here: {site.address}#{_invite(service, name)}", *service.notes, *address.warnings()]
     except BaseException:
         site.close()
         raise
     return site
-
-
-def terms_of(labeler: WebLabeler) -> Terms:
-    """What a project asks and how, from its settings."""
-    settings, task = labeler.settings, labeler.task
-    page = api.Page(
-        title=task.name,
-        question=settings.question or QUESTIONS[task.kind],
-        kind=cast(Literal["control", "text"], task.kind),
-        strength=settings.strength,
-        markdown=settings.markdown,
-        minimum_watched=settings.minimum_watched if task.kind == "control" else 0.0,
-        break_minutes=settings.break_minutes,
-        ui_version=pages.ui_version(pages.static_files()),
-    )
-    lease = settings.lease_seconds or (120.0 if task.kind == "control" else 600.0)
-    policy = Policy(settings.overlap, lease, settings.check_share, settings.repeat_share, settings.seed)
-    return Terms(
-        page=page,
-        policy=policy,
-        strengths=dict(settings.strengths),
-        guideline=settings.guideline,
-        consent=settings.consent,
-        fps=cast(ControlTask, task).fps if task.kind == "control" else 0.0,
-        fixed=labeler.fixed and not settings.stay_open,
-        check_warn=settings.check_warn,
-        check_pause=settings.check_pause,
-        rate=settings.requests_per_second,
-    )
-
-
-def hosts(labeler: WebLabeler) -> set[str]:
-    """The names under which the page may be reached."""
-    host = labeler.settings.host.lower()
-    own = set() if host in EVERYWHERE else {f"[{host}]" if ":" in host else host}
-    return {*LOOPBACK, *own, *(name.lower() for name in labeler.settings.allowed_hosts)}
-
-
-def warnings(labeler: WebLabeler) -> list[str]:
-    """What is open to others, and should be known to be."""
-    settings = labeler.settings
-    found = []
-    if settings.host not in ("127.0.0.1", "localhost", "::1") and settings.tls_cert is None:
-        found.append(
-            f"the page is served on {settings.host} without TLS: everybody on the way can read along, and take links; "
-            "set labeler.tls_cert and labeler.tls_key, or keep to a network that you trust"
-        )
-    if settings.host in EVERYWHERE and not settings.allowed_hosts:
-        found.append("people reach the page only by names in labeler.allowed_hosts, and there are none")
-    return found
 
 
 def _invite(service: Service, name: str) -> str:

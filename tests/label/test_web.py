@@ -21,7 +21,7 @@ from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
 from prefrl.label.web import WebLabeler, WebSettings
 from prefrl.page import serve
-from prefrl.page.site import hosts, warnings
+from prefrl.page.site import Address
 from prefrl.protocols import Attended
 from prefrl.rundir import Run, RunError
 from prefrl.stages import label
@@ -116,13 +116,13 @@ def test_presets_take_it_and_the_settings_come_back_as_they_were() -> None:
 
 
 def test_only_names_that_were_allowed_reach_the_page_and_open_pages_are_warned_about() -> None:
-    assert hosts(labeler()) == {"127.0.0.1", "localhost", "[::1]"}
-    assert warnings(labeler()) == []
-    everywhere = labeler(host="0.0.0.0", allowed_hosts=("Lab.example.org",))
-    assert "lab.example.org" in hosts(everywhere)
-    assert "0.0.0.0" not in hosts(everywhere)
-    assert "without TLS" in " ".join(warnings(everywhere))
-    assert "allowed_hosts" in " ".join(warnings(labeler(host="0.0.0.0")))
+    assert Address().names() == {"127.0.0.1", "localhost", "[::1]"}
+    assert Address().warnings() == []
+    everywhere = Address("0.0.0.0", allowed_hosts=("Lab.example.org",))
+    assert "lab.example.org" in everywhere.names()
+    assert "0.0.0.0" not in everywhere.names()
+    assert "without TLS" in " ".join(everywhere.warnings())
+    assert "allowed_hosts" in " ".join(Address("0.0.0.0").warnings())
 
 
 # --- the labeler ---------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from prefrl.types import Query, Response, Segment
 CONFIG = "task:\n  kind: point\n  segment_steps: 5\n  frame_size: 33\n"
 IMPORTS = """
 import os, sys, time
-from prefrl import clipworker as worker
+from prefrl.page.clips import worker
 from prefrl.envs.toys import PointTask
 """
 FILE = f"{'ab' * 32}.{formats()[0]}"
