@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 
 from prefrl.page import api
-from prefrl.page.questions import Policy
+from prefrl.page.questions import Policy, Terms
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
 from prefrl.storage.log import row
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Response

@@ -13,10 +13,9 @@ from starlette.types import ASGIApp
 
 from prefrl.page import api
 from prefrl.page.app import create_app
-from prefrl.page.questions import Policy
+from prefrl.page.questions import Policy, Terms
 from prefrl.page.security import Buckets
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
 from prefrl.store import Store
 
 ORIGIN = "http://127.0.0.1:8900"

@@ -16,8 +16,7 @@ from prefrl.components import ConfigError, Settings, missing
 from prefrl.label.checks import pick_checks
 from prefrl.page import api, static_files
 from prefrl.page.clips.queue import ClipSettings
-from prefrl.page.questions import Policy
-from prefrl.page.terms import Terms
+from prefrl.page.questions import Policy, Terms
 from prefrl.protocols import ControlTask, Store, Task
 from prefrl.types import C
 

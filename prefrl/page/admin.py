@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from prefrl.exchange.exports.given import Exported
 from prefrl.page import api
 from prefrl.page.access import Person
-from prefrl.page.overview import Health, Link, Overview
+from prefrl.page.api import Health, Link, Overview
 from prefrl.page.people import admin, errors, service_of
 from prefrl.page.security import Refused
 from prefrl.page.service import Service

@@ -19,9 +19,8 @@ from prefrl.page.access import Access, Event
 from prefrl.page.cards import Cards, ClipSource
 from prefrl.page.desk import Desk
 from prefrl.page.intake import Intake, Reopened, Taken
-from prefrl.page.questions import Given
+from prefrl.page.questions import Given, Terms, ignored
 from prefrl.page.security import Buckets, Refused
-from prefrl.page.terms import Terms, ignored
 from prefrl.page.texts import (
     TEXT,
     Consent,
@@ -250,7 +249,7 @@ class Service:
             await self.record(self.access.change(name, "paused", why))
 
     def _failing(self, name: str) -> str:
-        from prefrl.page.attention import failing  # it needs scipy; see `dashboard`
+        from prefrl.page.tallies import failing  # it needs scipy; see `dashboard`
 
         with self.store.log.reading() as connection:
             return failing(connection, name, self.terms.check_pause)

@@ -13,10 +13,10 @@ from prefrl.components import ConfigError
 from prefrl.page import records
 from prefrl.page.app import create_app
 from prefrl.page.clips.queue import Clips, ClipSettings
+from prefrl.page.questions import Terms
 from prefrl.page.security import LOOPBACK, Rules
 from prefrl.page.serve import WebServer, check_tls
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
 from prefrl.store import Store
 
 GOODBYE_SECONDS = 2.5

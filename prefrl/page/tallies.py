@@ -1,4 +1,6 @@
-"""What the columns of a ledger come to, person by person and between people. Pure functions."""
+"""What the columns of a ledger come to, person by person and between people.
+
+Pure functions, but for `attention`, which reads the log."""
 
 from __future__ import annotations
 
@@ -8,9 +10,11 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import sqlalchemy as sql
+from sqlalchemy import Connection
 
 from prefrl.page.api import AgreementRow, AnnotatorRow, Interval
-from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger
+from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger, best
 from prefrl.stats.intervals import Measured, position_test, share
 from prefrl.stats.raters import (
     Ratings,
@@ -21,7 +25,10 @@ from prefrl.stats.raters import (
     raw_agreement,
 )
 from prefrl.stats.triads import circular_triads
-from prefrl.types import Floats
+from prefrl.storage.events import read_answer
+from prefrl.storage.tables import assignment, event
+from prefrl.storage.tables import query as query_table
+from prefrl.types import Floats, Skip
 
 Rows = dict[str, Floats]
 """Columns of equal length; see `ledger`."""
@@ -167,3 +174,28 @@ def shortfall(name: str, rate: Interval | Measured, low: float) -> str:
 def interval(measured: Measured) -> Interval:
     """As it goes over the wire."""
     return Interval(**asdict(measured))
+
+
+def failing(connection: Connection, name: str, least: float) -> str:
+    """Why a person is to be paused: they surely answer a smaller share of checks as expected; "" where they may not."""
+    return shortfall("checks", attention(connection, name), least)
+
+
+def attention(connection: Connection, name: str) -> Measured:
+    """The share of check questions that a person answered as expected since they were last let in; skips apart."""
+    states = sql.select(sql.func.max(event.c.seq)).where(event.c.kind == "state", event.c.actor == name)
+    since = connection.scalar(states) or 0
+    mine = (assignment.c.annotator == name) & (assignment.c.purpose == "check") & (assignment.c.answered > since)
+    columns = *(event.c[column] for column in ("kind", "subject", "actor", "body")), query_table.c.expected
+    answered = sql.join(assignment, event, event.c.seq == assignment.c.answered)
+    joined = answered.join(query_table, query_table.c.id == assignment.c.query)
+    answers = [
+        (read_answer(row.kind, row.subject, row.actor, row.body), row.expected)
+        for row in connection.execute(sql.select(*columns).select_from(joined).where(mine))
+    ]
+    hits = [
+        best(answer) == expected
+        for answer, expected in answers
+        if not (isinstance(answer, Skip) and answer.reason == "skip")
+    ]
+    return share(sum(hits), len(hits), "no check question was answered")

@@ -14,9 +14,8 @@ from stores import responses
 from web_service import STRENGTHS, answering, ask_for, browser, log_in, page
 
 from prefrl.page.people import cookie_name
-from prefrl.page.questions import Policy
+from prefrl.page.questions import Policy, Terms
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
 from prefrl.page.texts import version_of
 from prefrl.store import Store
 

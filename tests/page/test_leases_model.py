@@ -26,10 +26,9 @@ from stores import responses
 from web_service import STRENGTHS, Clock, answering, page
 
 from prefrl.page import api, desk, records
-from prefrl.page.questions import Policy
+from prefrl.page.questions import Policy, Terms
 from prefrl.page.security import Refused
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
 from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
 

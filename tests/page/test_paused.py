@@ -13,10 +13,9 @@ from stores import responses
 from web_service import STRENGTHS, answering, ask_for, log_in, page
 
 from prefrl.page import records
-from prefrl.page.attention import attention
-from prefrl.page.questions import Policy
+from prefrl.page.questions import Policy, Terms
 from prefrl.page.service import Service
-from prefrl.page.terms import Terms
+from prefrl.page.tallies import attention
 from prefrl.store import Store
 
 
