@@ -31,7 +31,7 @@ from scipy.optimize import isotonic_regression
 from prefrl.components import settings_class
 from prefrl.config import Config
 from prefrl.fit.trainer import fit_judged
-from prefrl.improve.rollout import cut, whole_episodes
+from prefrl.policies.rollout import cut, whole_episodes
 from prefrl.seeding import streams
 from prefrl.store import Store
 from prefrl.types import Comparison, Judged, Query, gold_score
@@ -166,8 +166,8 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
 
 def text(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
     """Responses of the starting policy, to prompts for learning and to prompts for evaluation."""
-    from prefrl.improve.generate import Sampling
-    from prefrl.improve.responses import respond
+    from prefrl.policies.generate import Sampling
+    from prefrl.policies.language import respond
 
     def respond_to(prompts: list[str], samples: int) -> list[Any]:
         sampling = Sampling(samples, task.response_tokens, (int(task.tokenizer.eos_token_id),), 1.0)

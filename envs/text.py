@@ -13,9 +13,9 @@ from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
 from vaderSentiment.vaderSentiment import SentimentIntensityAnalyzer
 
 from prefrl.components import Settings
-from prefrl.envs.cloning import CloningSettings
 from prefrl.envs.grammar import Grammar
 from prefrl.envs.reviews import reviews, source
+from prefrl.policies.cloning import CloningSettings
 from prefrl.types import Floats, Response
 
 EVALUATION_SHARE = 8

@@ -21,9 +21,9 @@ from transformers import (
 )
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.cloning import make_tokenizer
 from prefrl.envs.text import for_evaluation
 from prefrl.exchange.formats import read_judgements
+from prefrl.policies.cloning import make_tokenizer
 from prefrl.types import Floats, Response
 
 ONLY_BYTES = 259

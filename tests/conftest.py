@@ -98,8 +98,8 @@ def postgres_url(postgres: str) -> str:
 @pytest.fixture(scope="session")
 def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
     """The text task with a tiny starting policy, cloned once for all tests."""
-    from prefrl.envs.cloning import CloningSettings
     from prefrl.envs.text import ReviewsSettings
+    from prefrl.policies.cloning import CloningSettings
 
     cache = tmp_path_factory.mktemp("models")
     cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)

@@ -21,8 +21,8 @@ from prefrl.improve.objectives import (
     policy_gradient,
     value_loss,
 )
-from prefrl.improve.policy import Policy
-from prefrl.improve.rollout import (
+from prefrl.policies.mlp import Policy
+from prefrl.policies.rollout import (
     Rollout,
     collect,
     control,

@@ -19,7 +19,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings
-from prefrl.improve.rollout import (
+from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
+from prefrl.policies.rollout import (
     Rollout,
     control,
     cut,
@@ -28,7 +29,6 @@ from prefrl.improve.rollout import (
     step_rewards,
     whole_episodes,
 )
-from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
 from prefrl.protocols import ControlTask, RewardModel, Store, Task
 from prefrl.seeding import draw_seed
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps

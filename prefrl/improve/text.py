@@ -14,7 +14,6 @@ from torch import Tensor
 
 from prefrl.components import Settings
 from prefrl.improve.formula import text_formula
-from prefrl.improve.generate import Sampling
 from prefrl.improve.objectives import (
     AdaptiveKL,
     Reduction,
@@ -28,7 +27,8 @@ from prefrl.improve.objectives import (
     step_rewards,
     step_weights,
 )
-from prefrl.improve.responses import Responses, all_logp, check_head, respond, response_logp, text
+from prefrl.policies.generate import Sampling
+from prefrl.policies.language import Responses, all_logp, check_head, respond, response_logp, text
 from prefrl.protocols import RewardModel, Store, Task, TextTask
 from prefrl.seeding import draw_seed
 from prefrl.types import Evaluation, Metrics, Response, State, Steps

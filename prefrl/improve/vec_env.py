@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from prefrl.improve.rollout import Rollout
+from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask, StepRewardModel, Transition
 from prefrl.types import Floats
 

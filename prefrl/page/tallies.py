@@ -1,6 +1,7 @@
 """What the columns of a ledger come to, person by person and between people.
 
-Pure functions, but for `attention`, which reads the log."""
+Pure functions, but for `attention`, which reads the log.
+"""
 
 from __future__ import annotations
 

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 from rich.console import Console
 from transformers import PreTrainedTokenizerBase
 
-from prefrl.envs.cloning import CloningSettings, progress
 from prefrl.envs.reviews import reviews, source
 from prefrl.envs.text import Reviews, ReviewsSettings
+from prefrl.policies.cloning import CloningSettings, progress
 from prefrl.types import Response
 
 REVIEWS = reviews()

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.improve.control import PPO, PPOSettings
-from prefrl.improve.rollout import Rollout
+from prefrl.policies.rollout import Rollout
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store

@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.rollout import learned_rewards
 from prefrl.improve.sb3 import SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
+from prefrl.policies.rollout import learned_rewards
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
 from prefrl.storage.checkpoints import load_state, save_state

@@ -21,10 +21,10 @@ from transformers import (
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.envs.cloning import make_tokenizer
 from prefrl.envs.toys import PointSettings
 from prefrl.label.judge import Judge, JudgeSettings, Verdict, bias
 from prefrl.label.prompts import Prompter, answer_tokens, fence_for, verdict
+from prefrl.policies.cloning import make_tokenizer
 from prefrl.store import Store
 from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from transformers import DynamicCache, PreTrainedModel
 
-from prefrl.improve.llama import LlamaDecoder
+from prefrl.policies.llama import LlamaDecoder
 
 KEEP_SHARE = 0.75
 """Ended rows are dropped once this share or less of the rows goes on: moving the cache costs more than a few rows."""

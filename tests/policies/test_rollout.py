@@ -11,7 +11,7 @@ import pytest
 
 from prefrl import Config
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.rollout import (
+from prefrl.policies.rollout import (
     OVERLAP,
     Act,
     Rollout,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from prefrl.envs.control import ControlSettings
-from prefrl.improve.policy import ActionSpace, Policy, forward
+from prefrl.policies.mlp import ActionSpace, Policy, forward
 
 
 def _policy(env: str, seed: int = 0) -> Policy:

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from transformers import GPT2Config, GPT2LMHeadModel, LlamaConfig, LlamaForCausalLM, PreTrainedModel
 
-from prefrl.improve.generate import Generation, Sampling, draw, generate, pad_left
-from prefrl.improve.llama import LlamaDecoder
-from prefrl.improve.responses import Responses, all_logp, response_logp
+from prefrl.policies.generate import Generation, Sampling, draw, generate, pad_left
+from prefrl.policies.language import Responses, all_logp, response_logp
+from prefrl.policies.llama import LlamaDecoder
 
 V = 50
 PROMPTS = [[1, 7, 8, 9, 10, 11], [1, 5], [1, 20, 21], [1]]

@@ -11,7 +11,7 @@ from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
-from prefrl.improve.generate import Sampling, generate
+from prefrl.policies.generate import Sampling, generate
 from prefrl.protocols import Task, TextTask
 from prefrl.types import Response
 
