@@ -36,7 +36,7 @@ class ReviewsSettings(Settings):
 
     def build(self) -> Reviews:
         grammar = reviews()
-        return Reviews(self, grammar, *self.cloning.build(grammar, source()))
+        return Reviews(self, grammar, *self.cloning.build(grammar.sample, source()))
 
 
 class Reviews:

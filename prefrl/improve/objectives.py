@@ -148,12 +148,6 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip: float 
     return 0.5 * torch.maximum(free, (near - returns) ** 2)
 
 
-def categorical_entropy(logits: Tensor) -> Tensor:
-    """(..., V) -> (...): entropy in nats."""
-    logp = logits.log_softmax(-1)
-    return -(logp.exp() * logp).sum(-1)
-
-
 # --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------
 # With d = log pi(a) - log ref(a). As a number k1 and k3 are unbiased. As a loss only k2's gradient is that of the
 # KL (on samples of pi itself): k1's is 0 in expectation and k3's is that of the other direction, KL(ref || pi).

@@ -1,4 +1,4 @@
-"""Behavioural cloning of a grammar: a small Llama-like model, made from a config and fitted by maximum likelihood.
+"""Behavioural cloning of texts: a small Llama-like model, made from a config and fitted by maximum likelihood.
 
 What comes out is kept under a digest of everything that went in; a damaged copy is made anew.
 """
@@ -9,10 +9,10 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import tokenizers
@@ -28,7 +28,6 @@ from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
 from transformers.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 
 from prefrl.components import Settings
-from prefrl.envs.grammar import Grammar
 from prefrl.seeding import draw_seed
 from prefrl.storage.files import DamagedError, verify, whole_folder
 
@@ -36,10 +35,12 @@ RECIPE = 1
 """Raise this when the same settings lead to another model: what older versions kept is then left alone."""
 PAD, BOS, EOS = "<pad>", "<bos>", "<eos>"
 IGNORED = -100
+Writer: TypeAlias = Callable[[np.random.Generator], tuple[str, str]]
+"""Draws one text, as the prompt and what follows it; the text is both put together."""
 
 
 class CloningSettings(Settings):
-    """The starting policy: its size, and how it learns to write like the grammar."""
+    """The starting policy: its size, and how it learns to write like the texts it is shown."""
 
     layers: int = Field(4, ge=1)
     """Of the Llama-like network."""
@@ -50,7 +51,7 @@ class CloningSettings(Settings):
     vocabulary: int = Field(2048, ge=300)
     """The most tokens of the byte-level BPE; 256 of them are the bytes."""
     reviews: int = Field(40_000, ge=64)
-    """How many texts the grammar writes; each is seen once."""
+    """How many texts are written to learn from; each is seen once."""
     batch_size: int = Field(8, ge=1)
     """Texts in a gradient step. Many small steps: with 16 texts a start now and then learns no topic, and is half as
     fluent."""
@@ -67,28 +68,31 @@ class CloningSettings(Settings):
             raise ValueError(f"width must be a multiple of 2 x heads, got {self.width} and {self.heads}")
         return self
 
-    def build(self, grammar: Grammar, source: str) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
-        """The model and its tokenizer: from the cache if they are there and whole, else cloned now."""
+    def build(self, write: Writer, source: str) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
+        """The model and its tokenizer: from the cache if they are there and whole, else cloned now.
+
+        `source` tells one writer from another.
+        """
         folder = (self.cache or user_cache_path("prefrl") / "models") / self.digest(source)
         if not folder.exists():
-            _make(self, grammar, folder)
+            _make(self, write, folder)
         try:
             return _load(folder)
         except DamagedError as error:
             Console(stderr=True).print(f"the kept starting policy is damaged ({error}); making it anew", soft_wrap=True)
             shutil.rmtree(folder)
-            _make(self, grammar, folder)
+            _make(self, write, folder)
             return _load(folder)
 
     def digest(self, source: str) -> str:
-        """Of the settings, the grammar's source, and the versions that decide the weights."""
+        """Of the settings, the writer's source, and the versions that decide the weights."""
         versions = [RECIPE, torch.__version__, transformers.__version__, tokenizers.__version__]
         everything = [self.model_dump(mode="json", exclude={"cache"}), source, versions]
         return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def _make(settings: CloningSettings, grammar: Grammar, folder: Path) -> None:
-    model, tokenizer = clone(settings, grammar)
+def _make(settings: CloningSettings, write: Writer, folder: Path) -> None:
+    model, tokenizer = clone(settings, write)
     with whole_folder(folder) as work, _quiet():
         model.save_pretrained(work)
         tokenizer.save_pretrained(work)
@@ -116,10 +120,10 @@ def _quiet() -> Iterator[None]:
             enable_progress_bar()  # type: ignore[no-untyped-call]
 
 
-def clone(settings: CloningSettings, grammar: Grammar) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
-    """Train the tokenizer and the model on texts of the grammar; the next token of whole texts is what is learned."""
+def clone(settings: CloningSettings, write: Writer) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
+    """Train the tokenizer and the model on new texts; the next token of whole texts is what is learned."""
     rng = np.random.default_rng(settings.seed)
-    pairs = [grammar.sample(rng) for _ in range(settings.reviews)]
+    pairs = [write(rng) for _ in range(settings.reviews)]
     tokenizer = make_tokenizer([prompt + rest for prompt, rest in pairs], settings.vocabulary)
     rows = [tokenizer.encode(prompt) + encode_rest(tokenizer, rest) for prompt, rest in pairs]
     with torch.random.fork_rng(devices=[]):

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.improve.objectives import categorical_entropy
 from prefrl.protocols import ControlTask
 from prefrl.seeding import draw_seed
 from prefrl.types import Floats, State
@@ -144,6 +143,12 @@ class Policy:
             x = np.tanh(x @ arrays[i].T + arrays[i + 1])
         out: Floats = x @ arrays[-2].T + arrays[-1]
         return out
+
+
+def categorical_entropy(logits: Tensor) -> Tensor:
+    """(..., V) -> (...): entropy in nats."""
+    logp = logits.log_softmax(-1)
+    return -(logp.exp() * logp).sum(-1)
 
 
 def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:

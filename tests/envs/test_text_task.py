@@ -143,17 +143,17 @@ def test_progress_is_a_bar_with_a_rate_on_a_terminal_and_one_line_elsewhere() ->
 
 def test_cloning_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        tiny(tmp_path / name).build(REVIEWS, source())
+        tiny(tmp_path / name).build(REVIEWS.sample, source())
     assert folder_bytes(tmp_path / "a") == folder_bytes(tmp_path / "b")
 
 
 @pytest.mark.parametrize("damage", ["model.safetensors", "tokenizer.json", "MANIFEST.json"])
 def test_a_damaged_copy_is_made_anew_and_said(tmp_path: Path, damage: str, capfd: pytest.CaptureFixture[str]) -> None:
-    tiny(tmp_path).build(REVIEWS, source())
+    tiny(tmp_path).build(REVIEWS.sample, source())
     before = folder_bytes(tmp_path)
     (file,) = tmp_path.glob(f"*/{damage}")
     file.write_bytes(file.read_bytes()[:-9])
-    tiny(tmp_path).build(REVIEWS, source())
+    tiny(tmp_path).build(REVIEWS.sample, source())
     assert "damaged" in capfd.readouterr().err
     assert folder_bytes(tmp_path) == before
 

@@ -235,10 +235,6 @@ def test_value_loss_takes_the_worse_of_free_and_clipped() -> None:
     torch.testing.assert_close(o.value_loss(values, old, returns, 0.2), torch.tensor([0.5 * 1.8**2, 0.005]))
 
 
-def test_entropy_of_even_odds_is_the_logarithm_of_the_choices() -> None:
-    torch.testing.assert_close(o.categorical_entropy(torch.zeros(2, 5)), torch.full((2,), math.log(5)))
-
-
 def test_the_adaptive_coefficient_moves_towards_its_target_and_no_faster_than_allowed() -> None:
     start = o.AdaptiveKL(beta=0.1, target=6.0, horizon=1000)
     assert start.update(6.0, 100).beta == pytest.approx(0.1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from prefrl.envs.control import ControlSettings
-from prefrl.policies.mlp import ActionSpace, Policy, forward
+from prefrl.policies.mlp import ActionSpace, Policy, categorical_entropy, forward
 
 
 def _policy(env: str, seed: int = 0) -> Policy:
@@ -84,3 +86,7 @@ def test_state_and_load_give_the_same_policy() -> None:
     assert other.act(observations, None)[0].tobytes() == policy.act(observations, None)[0].tobytes()
     with pytest.raises(ValueError, match="actor_0 has shape"):
         other.load(_policy("CartPole-v1").state())
+
+
+def test_entropy_of_even_odds_is_the_logarithm_of_the_choices() -> None:
+    torch.testing.assert_close(categorical_entropy(torch.zeros(2, 5)), torch.full((2,), math.log(5)))
