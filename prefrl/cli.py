@@ -196,7 +196,7 @@ def evaluate(
 def report(folder: Folder) -> None:
     """Write a run's report.html again, also while it goes on."""
     from prefrl.console import say
-    from prefrl.evaluate.report import write_report
+    from prefrl.report.report import write_report
 
     say(f"report: {write_report(folder)}")
 

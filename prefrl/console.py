@@ -17,9 +17,9 @@ from rich.progress import Task as Row
 from rich.table import Table
 from rich.text import Text
 
-from prefrl.evaluate import card_words
 from prefrl.evaluate.card import ReportCard
 from prefrl.loop import Loop
+from prefrl.report import card_words
 from prefrl.types import Round
 
 if TYPE_CHECKING:

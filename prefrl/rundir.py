@@ -16,12 +16,12 @@ import numpy as np
 from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.drift import first_judged, read_probes
-from prefrl.evaluate.examples import save_examples
-from prefrl.evaluate.report import write_report
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.grading import discount_of, grade, of_run
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, RewardModel, Task
+from prefrl.report.examples import save_examples
+from prefrl.report.report import write_report
 from prefrl.seeding import streams
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.storage.files import MANIFEST, DamagedError, verify, whole_folder, write_file

@@ -15,7 +15,6 @@ import numpy as np
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
-from prefrl.evaluate.report import render_card
 from prefrl.evaluate.summary import read_metrics
 from prefrl.exchange.formats import Which
 from prefrl.exchange.source import open_judgements
@@ -23,6 +22,7 @@ from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.protocols import Attended
+from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
 from prefrl.storage.checkpoints import load_state

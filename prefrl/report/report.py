@@ -10,11 +10,11 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from prefrl.evaluate.card import ReportCard
-from prefrl.evaluate.card_chapter import grades
-from prefrl.evaluate.chapters import chapters
-from prefrl.evaluate.facts import calibration, gather
-from prefrl.evaluate.records import Record, read, visible
-from prefrl.evaluate.words import headline, show_count, show_number, show_share, show_time, verdict
+from prefrl.report.card_chapter import grades
+from prefrl.report.chapters import chapters
+from prefrl.report.facts import calibration, gather
+from prefrl.report.records import Record, read, visible
+from prefrl.report.words import headline, show_count, show_number, show_share, show_time, verdict
 from prefrl.storage.files import write_file
 
 
@@ -51,7 +51,7 @@ def render_card(card: ReportCard) -> str:
 
 def _page(name: str, **values: Any) -> str:
     """A template filled in. All values are escaped; only this package's own figures and style are not."""
-    here = files("prefrl.evaluate")
+    here = files("prefrl.report")
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from prefrl.evaluate.examples import GAP, GREY, save_examples, strip
-from prefrl.evaluate.records import read
+from prefrl.report.examples import GAP, GREY, save_examples, strip
+from prefrl.report.records import read
 from prefrl.types import Response, Segment
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from prefrl.evaluate.facts import Facts
+from prefrl.report.facts import Facts
 
 
 def headline(facts: Facts) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from prefrl.evaluate.records import Record, mapping, number, visible, whole
 from prefrl.evaluate.summary import STAGES
+from prefrl.report.records import Record, mapping, number, visible, whole
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import pytest
 from linear_reward import LinearReward, segment
 
 from prefrl.evaluate.card import Bucket, ReportCard, undefined
-from prefrl.evaluate.card_words import groups, headline, span
-from prefrl.evaluate.report import render_card, write_report
 from prefrl.grading import Subject, grade
+from prefrl.report.card_words import groups, headline, span
+from prefrl.report.report import render_card, write_report
 from prefrl.types import Comparison, Judged, Query, Response
 
 WILD = "</bdi></td><script>alert(1)</script>\u202e\x1b{{ 7*7 }}"

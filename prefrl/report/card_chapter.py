@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from prefrl.evaluate import card_words, plots
 from prefrl.evaluate.calibration import Bin
 from prefrl.evaluate.card import Bucket, Estimate, ReportCard
-from prefrl.evaluate.card_words import Row
-from prefrl.evaluate.chapters import Card
-from prefrl.evaluate.plots import Bar, Line
-from prefrl.evaluate.words import show_number, show_share
+from prefrl.report import card_words, plots
+from prefrl.report.card_words import Row
+from prefrl.report.chapters import Card
+from prefrl.report.plots import Bar, Line
+from prefrl.report.words import show_number, show_share
 
 
 @dataclass(frozen=True)

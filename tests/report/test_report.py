@@ -10,9 +10,9 @@ import matplotlib
 import pytest
 from PIL import Image
 
-from prefrl.evaluate.records import MAX_TEXT, number, read, visible
-from prefrl.evaluate.report import write_report
-from prefrl.evaluate.words import show_count, show_number, show_share, show_time
+from prefrl.report.records import MAX_TEXT, number, read, visible
+from prefrl.report.report import write_report
+from prefrl.report.words import show_count, show_number, show_share, show_time
 
 WILD = "</pre></title><script>alert(1)</script><img src=x onerror=alert(1)>\u202e\u2066\"'{{ 7*7 }}\x00\x1b[31m\ud800"
 CSP = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from prefrl.evaluate.card import About, Bucket, Calibration, Estimate, LabelerPart, ReportCard
-from prefrl.evaluate.records import visible
-from prefrl.evaluate.words import show_count, show_number, show_share, show_time
+from prefrl.report.records import visible
+from prefrl.report.words import show_count, show_number, show_share, show_time
 
 PERCENT = "\N{NO-BREAK SPACE}%"
 UNDEFINED = "not defined: "

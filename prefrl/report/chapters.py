@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from prefrl.evaluate import plots
-from prefrl.evaluate.facts import Facts
-from prefrl.evaluate.plots import Line
-from prefrl.evaluate.records import Record, whole
 from prefrl.evaluate.summary import STAGES
+from prefrl.report import plots
+from prefrl.report.facts import Facts
+from prefrl.report.plots import Line
+from prefrl.report.records import Record, whole
 
 
 @dataclass(frozen=True)
