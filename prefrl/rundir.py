@@ -16,8 +16,8 @@ import numpy as np
 from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.drift import first_judged, read_probes
+from prefrl.evaluate.grade import discount_of, grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
-from prefrl.grading import discount_of, grade, of_run
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, RewardModel, Task
 from prefrl.report.examples import save_examples

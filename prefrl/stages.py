@@ -15,12 +15,12 @@ import numpy as np
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.grade import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.evaluate.summary import read_metrics
 from prefrl.exchange.formats import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
-from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.protocols import Attended
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config

@@ -10,7 +10,7 @@ import pytest
 from linear_reward import LinearReward, segment
 
 from prefrl.evaluate.card import Bucket, ReportCard, undefined
-from prefrl.grading import Subject, grade
+from prefrl.evaluate.grade import Subject, grade
 from prefrl.report.card_words import groups, headline, span
 from prefrl.report.report import render_card, write_report
 from prefrl.types import Comparison, Judged, Query, Response

@@ -9,10 +9,10 @@ import pytest
 from linear_reward import LinearReward, segment
 
 from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.grade import Habits, Subject, grade, habits, judgements
 from prefrl.fit.metrics import accuracy, brier, calibration_error
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
-from prefrl.grading import Habits, Subject, grade, habits, judgements
 from prefrl.store import Store
 from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response, Segment, gold_score
 
