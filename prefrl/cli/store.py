@@ -22,7 +22,7 @@ def verify(
     ] = None,
 ) -> None:
     """Check a store: its database, its chain of hashes, what is derived from it, its files."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.storage import maintenance
 
     if salvage is not None:
@@ -46,7 +46,7 @@ def backup(
     folder: Folder, to: Annotated[Path, typer.Option(help="The new folder that gets the copy.", show_default=False)]
 ) -> None:
     """Copy a store, also while people label, and check the copy."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.storage.maintenance import backup as back_up
 
     say(f"{back_up(folder, to)} events copied into {to}")
@@ -55,7 +55,7 @@ def backup(
 @commands.command()
 def migrate(folder: Folder) -> None:
     """Bring a store that an older prefrl made up to date; a copy of its database is kept in backups/."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.storage.log import EventLog, require_store
     from prefrl.storage.tables import SCHEMA
 

@@ -13,8 +13,8 @@ import pytest
 from shell import Shell
 from text_models import classifier, gpt2
 
+from prefrl.cli.console import interrupts
 from prefrl.components import TABLE, kinds
-from prefrl.console import interrupts
 from prefrl.envs.text import Reviews
 
 
@@ -178,7 +178,7 @@ def test_commands_that_only_tell_work(prefrl: Shell, line: str) -> None:
 
 def test_help_loads_nothing_heavy() -> None:
     heavy = {"torch", "transformers", "gymnasium", "pydantic", "sqlalchemy"}
-    code = f"import sys, prefrl.cli; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, prefrl.cli.main; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -186,7 +186,7 @@ def test_help_loads_nothing_heavy() -> None:
 def test_a_control_user_never_loads_transformers(tmp_path: Path) -> None:
     code = (
         "import sys; sys.argv = ['prefrl', 'run', 'control/toy', '--out', 'run']\n"
-        "from prefrl.cli import main\ntry: main()\nexcept SystemExit: print('transformers' in sys.modules)"
+        "from prefrl.cli.main import main\ntry: main()\nexcept SystemExit: print('transformers' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stdout.splitlines()[-1] == "False"

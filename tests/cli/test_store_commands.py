@@ -6,7 +6,7 @@ import pytest
 from stores import fill
 from typer.testing import CliRunner
 
-from prefrl.cli import app
+from prefrl.cli.main import app
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Response
@@ -52,7 +52,7 @@ def test_damage_is_named_repaired_where_it_can_be_and_what_is_whole_is_saved(fol
 
 
 def test_an_old_store_is_brought_up_to_date(tmp_path: Path) -> None:
-    shutil.copy(Path(__file__).parent / "data/store-1/store.db", tmp_path / "store.db")
+    shutil.copy(Path(__file__).parents[1] / "storage/data/store-1/store.db", tmp_path / "store.db")
     assert call("migrate", tmp_path)[1] == f"{tmp_path} has schema 2\n"
     assert call("verify", tmp_path)[0] == 0
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from prefrl.cli import main
-from prefrl.cli_data import Form, Rows
+from prefrl.cli.exchange import Form, Rows
+from prefrl.cli.main import main
 from prefrl.exchange.ports import EXPORTS
 from prefrl.exchange.text_rows import FORMS
 from prefrl.store import Store

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from prefrl import cli_data, cli_store
-from prefrl.cli_data import Labelers, Out, Split
+from prefrl.cli.exchange import Labelers, Out, Split
+from prefrl.cli.exchange import commands as exchange_commands
+from prefrl.cli.store import commands as store_commands
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
     from prefrl.config import Config
@@ -26,8 +27,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-app.add_typer(cli_data.commands)
-app.add_typer(cli_store.commands)
+app.add_typer(exchange_commands)
+app.add_typer(store_commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
@@ -49,7 +50,7 @@ def run(
     ] = False,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
-    from prefrl.console import drive, say
+    from prefrl.cli.console import drive, say
     from prefrl.rundir import Run
 
     config = _load(source, overrides)
@@ -65,7 +66,7 @@ def run(
 @app.command()
 def resume(folder: Folder) -> None:
     """Go on with a run that was stopped."""
-    from prefrl.console import drive
+    from prefrl.cli.console import drive
     from prefrl.rundir import Run
 
     drive(Run.resume(folder))
@@ -92,7 +93,7 @@ def label(
 ) -> None:
     """Collect judgements: ask `loop.labels` queries and have the labeler answer them."""
     from prefrl import stages
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.rundir import open_saved
     from prefrl.storage.log import has_store
 
@@ -131,7 +132,7 @@ def fit(
 ) -> None:
     """Fit a reward model on judgements, and save it."""
     from prefrl import stages
-    from prefrl.console import console, metrics_table, say
+    from prefrl.cli.console import console, metrics_table, say
     from prefrl.exchange.formats import Which
 
     settings = _load(stages.config_of(source, config), overrides)
@@ -153,7 +154,7 @@ def improve(
 ) -> None:
     """Improve a policy against a saved reward model."""
     from prefrl import stages
-    from prefrl.console import drive
+    from prefrl.cli.console import drive
     from prefrl.rundir import Run
 
     drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
@@ -179,7 +180,7 @@ def evaluate(
 ) -> None:
     """Evaluate the newest policy of a run, or grade a reward model."""
     from prefrl import stages
-    from prefrl.console import card_table, console, metrics_table
+    from prefrl.cli.console import card_table, console, metrics_table
     from prefrl.exchange.formats import Which
 
     if reward is not None:
@@ -195,7 +196,7 @@ def evaluate(
 @app.command()
 def report(folder: Folder) -> None:
     """Write a run's report.html again, also while it goes on."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.report.report import write_report
 
     say(f"report: {write_report(folder)}")
@@ -204,8 +205,8 @@ def report(folder: Folder) -> None:
 @app.command()
 def presets() -> None:
     """List the presets."""
+    from prefrl.cli.console import console, table
     from prefrl.config import presets
-    from prefrl.console import console, table
 
     console.print(table("presets: prefrl run NAME --out DIR", ("name", "what it shows"), presets().items()))
 
@@ -218,11 +219,11 @@ def describe(
     """Explain a component's settings, or a preset; without a name, list the kinds."""
     from rich.text import Text
 
-    from prefrl.console import console
-    from prefrl.explain import explain
+    from prefrl.cli.console import console
+    from prefrl.cli.describe import explain
 
     if schema:
-        from prefrl.schema import text
+        from prefrl.cli.schema import text
 
         print(text(), end="")
         return
@@ -233,8 +234,8 @@ def describe(
 @app.command()
 def doctor() -> None:
     """Say what is installed, what is missing, and what to do about it."""
-    from prefrl.console import console
-    from prefrl.doctor import diagnose
+    from prefrl.cli.console import console
+    from prefrl.cli.doctor import diagnose
 
     console.print(diagnose())
 
@@ -272,7 +273,7 @@ def _load(source: str, overrides: list[str] | None) -> Config:
 
 
 def _dry_run(config: Config) -> None:
-    from prefrl.console import duration, say
+    from prefrl.cli.console import duration, say
     from prefrl.stages import estimate
 
     seconds = estimate(config)
@@ -288,8 +289,8 @@ def main() -> None:
     except (ValueError, FloatingPointError, ModuleNotFoundError, OSError) as error:
         if os.environ.get("PREFRL_DEBUG"):
             raise
+        from prefrl.cli.console import errors
         from prefrl.components import missing
-        from prefrl.console import errors
 
         text = missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
         for line in text.splitlines():

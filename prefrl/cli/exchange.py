@@ -75,7 +75,7 @@ def export_(
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Write judgements, or a reward model of text, to files, and say what these could not hold."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
 
     if to.is_file() and not force:
         raise ValueError(f"{to} is there already: choose another name, or write over it with --force")
@@ -110,7 +110,7 @@ def import_(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, write nothing.")] = False,
 ) -> None:
     """Read judgements from files into a store, all or none."""
-    from prefrl.console import say
+    from prefrl.cli.console import say
     from prefrl.exchange.formats import Layout, Which
 
     layout = Layout.of(form.value, map_, skip_bad)

@@ -10,8 +10,8 @@ from importlib.util import find_spec
 
 from rich.table import Table
 
+from prefrl.cli.console import table
 from prefrl.components import EXTRAS
-from prefrl.console import table
 
 CORE = ("prefrl", "torch", "numpy", "pydantic", "SQLAlchemy", "safetensors")
 DISTRIBUTIONS = {"stable_baselines3": "stable-baselines3"}

@@ -13,9 +13,9 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
+from prefrl.cli.console import table
 from prefrl.components import TABLE, ConfigError, Role, Settings, kinds, settings_class, suggest
 from prefrl.config import Config, presets
-from prefrl.console import table
 from prefrl.fit.settings import FittingSettings
 from prefrl.loop import LoopSettings
 
