@@ -39,7 +39,8 @@ from prefrl.fit.metrics import accuracy
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.types import Comparison, Judged, Query, Ranking
+from prefrl.judgements import Comparison, Judged, Ranking
+from prefrl.types import Query
 
 HELD_OUT, WORDS = 0.25, 1024
 SETTINGS = {

@@ -31,10 +31,11 @@ from scipy.optimize import isotonic_regression
 from prefrl.components import settings_class
 from prefrl.config import Config
 from prefrl.fit.trainer import fit_judged
+from prefrl.judgements import Comparison, Judged
 from prefrl.policies.rollout import cut, whole_episodes
 from prefrl.seeding import streams
 from prefrl.store import Store
-from prefrl.types import Comparison, Judged, Query, gold_score
+from prefrl.types import Query, gold_score
 
 MEMBERS, CHOSEN, FIRST_SEED = 5, "information+k_medoids", 1
 HEADS = ("reward.train=head", "fitting.learning_rate=0.01", "fitting.epochs=30")

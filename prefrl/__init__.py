@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from prefrl.fit.pairs import Batch
-from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.judgements import Choice, Comparison, Ranking, Rating, Skip
+from prefrl.types import Query, Response, Segment
 
 if TYPE_CHECKING:
     from prefrl.config import Config as Config

@@ -10,20 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from prefrl.types import (
-    Answer,
-    C,
-    C_contra,
-    Evaluation,
-    Floats,
-    Judged,
-    Metrics,
-    Query,
-    Response,
-    Segment,
-    State,
-    Steps,
-)
+from prefrl.judgements import Answer, Judged
+from prefrl.types import C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
 
 if TYPE_CHECKING:
     import torch

@@ -16,6 +16,7 @@ from typing import Any, Generic
 
 import sqlalchemy as sql
 
+from prefrl.judgements import Answer, Judged, Skip, check_fits
 from prefrl.storage.arrivals import Merged, check_arrivals
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.events import ANSWER_TYPES, describe, load_candidate, read_answer
@@ -23,7 +24,7 @@ from prefrl.storage.log import EventLog, StoreError, Transaction, row
 from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
-from prefrl.types import Answer, C, Candidate, Floats, Judged, Query, Segment, Skip, check_fits
+from prefrl.types import C, Candidate, Floats, Query, Segment
 
 WRITERS = 16
 """Files written at once."""

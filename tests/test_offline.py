@@ -16,9 +16,10 @@ from prefrl.envs.texts import Texts, TextsSettings
 from prefrl.exchange.formats import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.trainer import NothingToFit
+from prefrl.judgements import Ranking
 from prefrl.stages import fit_reward, shrink
 from prefrl.store import Store
-from prefrl.types import Query, Ranking, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 TOY = {
     "task": {"kind": "point"},

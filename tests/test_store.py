@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from stores import derived, fill, responses
 
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.storage.files import DamagedError
 from prefrl.storage.log import StoreError
 from prefrl.storage.maintenance import backup, verify_store
 from prefrl.storage.projection import dump, rebuild
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
 

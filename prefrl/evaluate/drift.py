@@ -12,7 +12,8 @@ import numpy as np
 
 from prefrl.evaluate.card import Drift, Estimate, undefined
 from prefrl.evaluate.intervals import correlate
-from prefrl.types import C, Judged
+from prefrl.judgements import Judged
+from prefrl.types import C
 
 PROBES = 64
 """How many of the first judged candidates are scored after each fit."""

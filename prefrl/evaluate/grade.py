@@ -34,9 +34,10 @@ from prefrl.fit.pairs import compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import split
 from prefrl.fit.terms import Ties
+from prefrl.judgements import Judged, person
 from prefrl.protocols import RewardModel, Store
 from prefrl.storage.files import DamagedError
-from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score, person
+from prefrl.types import Candidate, Floats, Integers, Query, Response, Segment, gold_score
 
 DRAWN = 300
 """Candidates in a scatter plot."""

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from prefrl.exchange.reading import TABLES, list_files
-from prefrl.types import Answer, Judged, Query, Skip, person
+from prefrl.judgements import Answer, Judged, Skip, person
+from prefrl.types import Query
 
 SHOWN_ERRORS = 20
 SHOWN_REPEATS = 5

@@ -18,6 +18,7 @@ from prefrl.exchange.exports.table import export_csv
 from prefrl.exchange.exports.tools import export_arena, export_argilla, export_label_studio
 from prefrl.exchange.formats import Layout, Row, Which, check_file
 from prefrl.exchange.recognition import recognised
+from prefrl.judgements import Answer
 from prefrl.storage.arrivals import Against, otherwise
 from prefrl.storage.blobs import write_arrays
 from prefrl.storage.events import describe, read_answer
@@ -25,7 +26,7 @@ from prefrl.storage.log import StoreError, Transaction, row
 from prefrl.storage.projection import CHUNK, RETRACTED, chunks, words
 from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.types import Answer, Candidate, Segment
+from prefrl.types import Candidate, Segment
 
 
 @dataclass(frozen=True)

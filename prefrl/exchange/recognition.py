@@ -14,8 +14,9 @@ import sqlalchemy as sql
 
 from prefrl.exchange.exports.given import stored_queries
 from prefrl.exchange.formats import Row
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.tables import query as asked
-from prefrl.types import Answer, Candidate, Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.types import Candidate, Query, Response, Segment
 
 QUERY = re.compile("[0-9a-f]{64}")
 

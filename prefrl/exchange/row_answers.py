@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any
 
 from prefrl.exchange.formats import Row
-from prefrl.numeric import is_whole
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, is_whole
 from prefrl.storage.events import check_answer
-from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
+from prefrl.types import Query, Response
 
 VERDICTS = ("ranks", "best", "ratings", "preference", "skip")
 """Columns of which one says the answer."""

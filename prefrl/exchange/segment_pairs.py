@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from prefrl.exchange.formats import Parts, Row
-from prefrl.types import Comparison, Query, Segment
+from prefrl.judgements import Comparison
+from prefrl.types import Query, Segment
 
 ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
 

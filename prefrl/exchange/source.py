@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 from prefrl.exchange.formats import Which
 from prefrl.exchange.ports import import_judgements
+from prefrl.judgements import Judged, person
 from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
-from prefrl.types import Judged, Segment, person
+from prefrl.types import Segment
 
 
 class Opened(NamedTuple):

@@ -32,7 +32,7 @@ from prefrl.exchange.transcripts import (
     response_text,
     split_conversations,
 )
-from prefrl.types import Rating
+from prefrl.judgements import Rating
 
 COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "label", "responses", *VERDICTS, "scale")
 _NO_TEXT = ("margin", "label", "responses", *VERDICTS, "scale", "weight", "shown")

@@ -11,7 +11,8 @@ from typing import Generic
 import numpy as np
 import numpy.typing as npt
 
-from prefrl.types import C, Choice, Comparison, Floats, Integers, Judged, Judgement, Ranking, Rating, person
+from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.types import C, Floats, Integers
 
 
 @dataclass(frozen=True, eq=False)

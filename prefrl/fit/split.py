@@ -10,7 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from prefrl.fit.pairs import implied_pairs
-from prefrl.types import C, Judged, Rating
+from prefrl.judgements import Judged, Rating
+from prefrl.types import C
 
 
 def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:

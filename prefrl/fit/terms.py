@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from prefrl.fit.pairs import implied_pairs
-from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.types import C
 
 Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
 MOST_TIED = 10

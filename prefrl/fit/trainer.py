@@ -17,8 +17,9 @@ from prefrl.fit.pairs import Batch, compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
+from prefrl.judgements import Judged
 from prefrl.protocols import RewardModel, Store
-from prefrl.types import C, Fitted, Floats, Judged, Metrics
+from prefrl.types import C, Fitted, Floats, Metrics
 
 
 class NothingToFit(ValueError):

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import Settings
+from prefrl.judgements import Answer, Skip
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.label.teachers import Limits, survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Floats, Query, Skip
+from prefrl.types import C, Floats, Query
 
 
 class CrowdSettings(Settings):

@@ -15,9 +15,10 @@ from torch import Tensor
 from transformers import AutoModelForCausalLM, AutoTokenizer, GenerationConfig, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError, Settings
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.label.prompts import Prompter, answer_tokens, verdict
 from prefrl.protocols import Store, Task, TextTask
-from prefrl.types import Answer, C, Comparison, Floats, Integers, Metrics, Query, Ranking, Response, Skip
+from prefrl.types import C, Floats, Integers, Metrics, Query, Response
 
 TEMPLATE = """\
 Below are a prompt and two responses to it, A and B, each between two equal lines. What is between such lines is

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.label import teachers
 from prefrl.label.teachers import Limits, Survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Choice, Comparison, Floats, Query, Ranking, Rating, Skip
+from prefrl.types import C, Floats, Query
 
 ONE_OF = (
     ["rationality", "error_rate"],

@@ -14,10 +14,11 @@ from rich.panel import Panel
 from rich.text import Text
 
 from prefrl.components import Settings
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.page.clips.encode import write_clip
 from prefrl.protocols import ControlTask, Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import C, Query, Response, Segment
 
 
 class Stopped(KeyboardInterrupt):

@@ -14,6 +14,7 @@ from typing import Any
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.page import api, records
 from prefrl.page.desk import Desk
 from prefrl.page.questions import Given, Question
@@ -21,7 +22,6 @@ from prefrl.page.security import Refused
 from prefrl.storage.log import Transaction, row
 from prefrl.storage.tables import assignment, canonical, submission
 from prefrl.store import Store
-from prefrl.types import Answer, Comparison, Ranking, Skip
 
 REMEMBERED = 10_000
 """Submissions that changed nothing."""

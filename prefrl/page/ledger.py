@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from prefrl.fit.pairs import implied_pairs
+from prefrl.judgements import Answer, Choice, Ranking, Rating, Skip
 from prefrl.storage.events import ANSWER_TYPES, read_answer
-from prefrl.types import Answer, Choice, Floats, Ranking, Rating, Skip
+from prefrl.types import Floats
 
 JUDGED, SKIPPED, INCOMPARABLE = 0, 1, 2
 LABEL, CHECK, REPEAT = 0, 1, 2

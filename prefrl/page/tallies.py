@@ -14,6 +14,7 @@ import numpy.typing as npt
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
+from prefrl.judgements import Skip
 from prefrl.page.api import AgreementRow, AnnotatorRow, Interval
 from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger, best
 from prefrl.stats.intervals import Measured, position_test, share
@@ -29,7 +30,7 @@ from prefrl.stats.triads import circular_triads
 from prefrl.storage.events import read_answer
 from prefrl.storage.tables import assignment, event
 from prefrl.storage.tables import query as query_table
-from prefrl.types import Floats, Skip
+from prefrl.types import Floats
 
 Rows = dict[str, Floats]
 """Columns of equal length; see `ledger`."""

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
+from prefrl.judgements import Answer, Comparison
 from prefrl.storage.engines import StoreError
 from prefrl.storage.events import (
     check_answer,
@@ -26,7 +27,7 @@ from prefrl.storage.events import (
 )
 from prefrl.storage.projection import ANSWERS, CHUNK, chunks
 from prefrl.storage.tables import event
-from prefrl.types import Answer, Comparison, Query
+from prefrl.types import Query
 
 SHOWN = 20
 """How many contradictions are told."""

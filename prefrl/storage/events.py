@@ -11,22 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.numeric import is_whole
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, check_fits, is_whole
 from prefrl.storage.blobs import read_arrays
 from prefrl.storage.engines import StoreError
 from prefrl.storage.projection import ANSWERS
-from prefrl.types import (
-    Answer,
-    Candidate,
-    Choice,
-    Comparison,
-    Ranking,
-    Rating,
-    Response,
-    Segment,
-    Skip,
-    check_fits,
-)
+from prefrl.types import Candidate, Response, Segment
 
 ANSWER_TYPES: dict[str, type[Answer]] = dict(zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Skip), strict=True))
 PORTABLE = ("candidate", "query", *ANSWERS, "retract", "assign", "repeat", "guideline", "flag")

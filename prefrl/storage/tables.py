@@ -6,9 +6,8 @@ import hashlib
 import json
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sql
-
-from prefrl.numeric import plain
 
 SCHEMA = 2
 metadata = sql.MetaData()
@@ -148,3 +147,10 @@ def chained(before: str, row: dict[str, Any]) -> str:
     fields = [row[name] for name in ("seq", "id", "kind", "subject", "actor", "at")]
     body = row["body"] if isinstance(row["body"], str) else canonical(row["body"])
     return hashlib.sha256(json.dumps([before, *fields, body]).encode()).hexdigest()
+
+
+def plain(value: Any) -> Any:
+    """NumPy's numbers as Python's, for JSON. Raises `TypeError` for anything else."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON: {value!r:.200}")

@@ -14,12 +14,13 @@ import numpy as np
 import sqlalchemy as sql
 
 from prefrl.envs.toys import PointSettings
+from prefrl.judgements import Answer, Comparison
 from prefrl.label.web import WebLabeler, WebSettings
 from prefrl.page.service import Service
 from prefrl.page.site import Site
 from prefrl.storage import tables
 from prefrl.store import Store
-from prefrl.types import Answer, Comparison, Query, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 STEPS = 15
 POINT = PointSettings(segment_steps=STEPS)

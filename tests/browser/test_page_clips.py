@@ -12,7 +12,8 @@ from browser.house import STEPS, House, Open, copy, fill, segment
 from browser.visitor import Visit, Visitor
 from playwright.sync_api import expect
 
-from prefrl.types import Query, Skip
+from prefrl.judgements import Skip
+from prefrl.types import Query
 
 pytestmark = pytest.mark.browser
 FPS = 10.0

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from shell import Shell
 
+from prefrl.judgements import Comparison
 from prefrl.store import Store
-from prefrl.types import Comparison, Response
+from prefrl.types import Response
 
 
 @pytest.mark.parametrize(

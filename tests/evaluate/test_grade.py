@@ -13,8 +13,9 @@ from prefrl.evaluate.grade import Habits, Subject, grade, habits, judgements
 from prefrl.fit.metrics import accuracy, brier, calibration_error
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response, Segment, gold_score
+from prefrl.types import Query, Response, Segment, gold_score
 
 WEIGHTS = (1.0, -1.0, 0.5)
 

@@ -12,10 +12,11 @@ from stores import fill, seal
 from prefrl.exchange.bundles import export_bundle, import_bundle
 from prefrl.exchange.formats import Layout
 from prefrl.exchange.ports import import_judgements, try_import
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.storage import log
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 
 def texts(*names: str) -> Query[Response]:

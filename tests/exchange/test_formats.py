@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from prefrl.exchange.formats import Which, read_judgements
 from prefrl.exchange.ports import import_judgements
 from prefrl.exchange.text_rows import parse
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Judged, Ranking, Rating, Response, Segment
+from prefrl.types import Response, Segment
 
 PAIR = {"prompt": "p", "chosen": "yes", "rejected": "no"}
 RANKED = {"prompt": "p", "responses": ["a", "b", "c"], "ranks": [2, 0, 0]}

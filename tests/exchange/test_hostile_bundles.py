@@ -10,8 +10,9 @@ from stores import seal
 
 from prefrl.exchange.bundles import export_bundle, import_bundle
 from prefrl.exchange.ports import try_import
+from prefrl.judgements import Comparison, Ranking
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 HUGE = 10**400
 

@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 
 from prefrl.exchange.ports import export, import_judgements
+from prefrl.judgements import Comparison
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Segment
+from prefrl.types import Query, Segment
 
 pytest.importorskip("minari")
 

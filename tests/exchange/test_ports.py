@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 
 from prefrl.exchange.ports import export_bundle, export_preferences, import_bundle, import_judgements
+from prefrl.judgements import Comparison, Ranking
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 
 def lines(*rows: Mapping[str, object]) -> str:

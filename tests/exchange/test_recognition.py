@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from prefrl.exchange.ports import export, import_judgements, try_import
+from prefrl.judgements import Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 
 def asked(*texts: str, token: int = 1, prompt: str = "Human: p\n\nAssistant: ") -> Query[Response]:

@@ -8,9 +8,10 @@ import pytest
 from prefrl.exchange.formats import Layout, Row, read_judgements
 from prefrl.exchange.ports import import_judgements, try_import
 from prefrl.exchange.text_rows import parse
+from prefrl.judgements import Comparison, Rating, Skip
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Comparison, Rating, Response, Skip
+from prefrl.types import Response
 
 PAIR: dict[str, Any] = {"prompt": "p", "chosen": "yes", "rejected": "no"}
 BAD = {"prompt": "p", "chosen": "yes"}

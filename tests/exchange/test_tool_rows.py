@@ -6,7 +6,7 @@ import pytest
 from prefrl.exchange.formats import Layout, Row
 from prefrl.exchange.text_rows import form_of, parse
 from prefrl.exchange.tool_rows import user_id
-from prefrl.types import Choice, Comparison, Ranking, Skip
+from prefrl.judgements import Choice, Comparison, Ranking, Skip
 
 FIELDS = {"instruction": "p", "generation-2": "b", "generation-1": "a"}
 TASK = {"data": {"prompt": "p", "text1": "a", "text2": "b"}}

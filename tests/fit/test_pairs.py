@@ -1,7 +1,8 @@
 import numpy as np
 
 from prefrl.fit.pairs import batch, compared, implied_pairs
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Response
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
+from prefrl.types import Query, Response
 
 
 def response(text: str) -> Response:

@@ -11,9 +11,10 @@ from prefrl.components import ConfigError, settings_class
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment
+from prefrl.types import Query, Segment
 
 WEIGHTS = np.array([1.0, -2.0, 0.5, 1.0, 0.0])
 

@@ -22,11 +22,12 @@ from transformers import (
 from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.label.judge import Judge, JudgeSettings, Verdict, bias
 from prefrl.label.prompts import Prompter, answer_tokens, fence_for, verdict
 from prefrl.policies.cloning import make_tokenizer
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 SHORT = "{prompt}\n{first}\n{second}\n{criterion} Answer:"
 CHAT = "{{ '<bos>' }}{% for m in messages %}[{{ m.role }}] {{ m.content }}<eos>{% endfor %}[assistant] "

@@ -11,12 +11,13 @@ import pytest
 from starlette.testclient import TestClient
 from web_service import answering, ask_for, browser, invite, log_in, serving
 
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.page.app import routes
 from prefrl.page.people import cookie_name
 from prefrl.page.service import Service
 from prefrl.storage.log import StoreFull
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
 

@@ -2,10 +2,11 @@
 
 import pytest
 
+from prefrl.judgements import Comparison, Skip
 from prefrl.page.figures import Dashboard, Figures
 from prefrl.storage.log import row
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response, Skip
+from prefrl.types import Query, Response
 
 
 @pytest.fixture

@@ -12,10 +12,11 @@ from starlette.testclient import TestClient
 from stores import responses
 from web_service import answering, ask_for, browser, invite, log_in, serving
 
+from prefrl.judgements import Comparison
 from prefrl.page.security import BODY, LARGER
 from prefrl.page.service import Service
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 PAIR = {"prompt": "Say hello", "responses": ["hello", "go away"]}
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from made_log import NOW, Made, sweep
 
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.page import tallies
 from prefrl.page.api import AnnotatorRow
 from prefrl.page.ledger import LEFT, RIGHT, TIE, UNKNOWN, best, first_shown, said
 from prefrl.stats.intervals import position_test, share
-from prefrl.types import Answer, Choice, Comparison, Ranking, Rating, Skip
 
 Generator = np.random.Generator
 

@@ -14,16 +14,18 @@ from pathlib import Path
 import pytest
 from stores import checkpoint, responses
 
+from prefrl.judgements import Comparison
 from prefrl.storage.files import write_file
 from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
-from prefrl.types import Comparison, Response
+from prefrl.types import Response
 
 WRITER = """
 import resource, signal, sys
 from pathlib import Path
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response
+from prefrl.judgements import Comparison
+from prefrl.types import Query, Response
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 queries = [Query((Response(f"p{i}", "a"), Response(f"p{i}", "b" * 300))) for i in range(40)]

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from stores import checkpoint, derived, fill, logical, responses
 
+from prefrl.judgements import Comparison
 from prefrl.storage.log import DamagedStore, StoreError
 from prefrl.storage.maintenance import backup, repair_derived, salvage, verify_store
 from prefrl.storage.projection import dump, rebuild
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 
 @pytest.fixture

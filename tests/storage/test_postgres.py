@@ -11,11 +11,12 @@ import sqlalchemy as sql
 from sqlalchemy.exc import DBAPIError
 from stores import derived, fill, responses
 
+from prefrl.judgements import Comparison
 from prefrl.storage.log import DamagedStore, StoreError
 from prefrl.storage.maintenance import backup, repair_derived, verify_store
 from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.types import Comparison, Response
+from prefrl.types import Response
 
 
 @pytest.fixture

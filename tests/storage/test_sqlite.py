@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from prefrl.judgements import Comparison
 from prefrl.storage.log import StoreError, StoreFull
 from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
 HOLDER = """

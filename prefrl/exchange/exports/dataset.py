@@ -25,12 +25,12 @@ from prefrl.exchange.exports.given import (
     knows_strengths,
 )
 from prefrl.exchange.exports.rows import each_judgement, each_pair, margin
+from prefrl.judgements import Comparison, Skip
 from prefrl.storage.files import whole_folder, write_file
 from prefrl.storage.log import StoreError
 from prefrl.storage.projection import chunks
 from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.types import Comparison, Skip
 
 PAIRS = "preferences"
 FILE = "train-00000-of-00001.parquet"

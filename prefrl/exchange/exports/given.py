@@ -15,6 +15,7 @@ from typing import IO, Any, NamedTuple
 
 import sqlalchemy as sql
 
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.events import load_candidate, read_answer
 from prefrl.storage.files import make_folder, sync_folder
 from prefrl.storage.log import StoreError
@@ -22,7 +23,7 @@ from prefrl.storage.projection import ANSWERS, CHUNK, all_events, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
 from prefrl.store import Store
-from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Skip
+from prefrl.types import Query, Response
 
 LABELER = "annotator's name"
 ORDER = "order in which candidates were shown"

@@ -27,8 +27,9 @@ from prefrl.exchange.exports.given import (
 )
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
 from prefrl.fit.pairs import implied_pairs
+from prefrl.judgements import Rating, Skip
 from prefrl.store import Store
-from prefrl.types import Rating, Response, Skip
+from prefrl.types import Response
 
 BOTH = "tie written both ways"
 MIDDLE = "response that is neither better than all others nor worse"

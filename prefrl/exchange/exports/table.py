@@ -10,9 +10,9 @@ from typing import IO, Any
 from prefrl.exchange.exports.given import LABELER, STRENGTH, TIME, WEIGHT, Exported, Tally, whole_file
 from prefrl.exchange.exports.rows import Pair, each_pair
 from prefrl.exchange.guard import GUARDED, guarded
+from prefrl.judgements import Skip
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Skip
 
 TEXTS = ("prompt", "chosen", "rejected", "labeler")
 COLUMNS = ("prompt", "chosen", "rejected", "preference", "labeler", "weight", "at", "query", GUARDED)

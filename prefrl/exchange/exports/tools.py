@@ -25,8 +25,9 @@ from prefrl.exchange.exports.rows import ALONE, UNTOLD
 from prefrl.exchange.tool_rows import user_id
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
 from prefrl.fit.pairs import implied_pairs
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Skip
 from prefrl.store import Store
-from prefrl.types import Answer, Choice, Comparison, Ranking, Response, Skip
+from prefrl.types import Response
 
 SOME_RATING = "rating, for which records hold no question"
 

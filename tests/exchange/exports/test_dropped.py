@@ -13,9 +13,10 @@ import pytest
 
 from prefrl.exchange.ports import EXPORTS, export
 from prefrl.exchange.transcripts import prompt_text
+from prefrl.judgements import Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.log import StoreError, row
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 CHAT = prompt_text([{"role": "user", "content": "hi"}])
 

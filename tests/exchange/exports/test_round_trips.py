@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from prefrl.exchange.ports import export, import_judgements
 from prefrl.exchange.transcripts import prompt_text
 from prefrl.fit.pairs import implied_pairs
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.store import Store
-from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 TEXT = st.text(st.characters(blacklist_categories=["Cs"]), max_size=8) | st.sampled_from(
     ["=1+1", "@x", "'quoted", "", " ", "a,b", 'say "x"', "line\nbreak", "\r", "\x00", "\u2028", "[1]", "NA", "Human: x"]
