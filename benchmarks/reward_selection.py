@@ -32,7 +32,8 @@ from prefrl.components import settings_class
 from prefrl.config import Config
 from prefrl.fit.trainer import fit_judged
 from prefrl.judgements import Comparison, Judged
-from prefrl.policies.rollout import cut, whole_episodes
+from prefrl.policies.rollout import whole_episodes
+from prefrl.sample.segments import cut
 from prefrl.seeding import streams
 from prefrl.store import Store
 from prefrl.types import Query, gold_score

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings
+from prefrl.evaluate.policies import evaluation
 from prefrl.improve.objectives import (
     clipped_surrogate,
     gae,
@@ -22,19 +23,9 @@ from prefrl.improve.objectives import (
     value_loss,
 )
 from prefrl.policies.mlp import Policy
-from prefrl.policies.rollout import (
-    Rollout,
-    collect,
-    control,
-    cut,
-    evaluation,
-    first_rollout,
-    joined,
-    learned_rewards,
-    step_rewards,
-    whole_episodes,
-)
+from prefrl.policies.rollout import Rollout, collect, control, joined, learned_rewards, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task
+from prefrl.sample.segments import cut, first_rollout
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 

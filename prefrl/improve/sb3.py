@@ -19,17 +19,11 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings
+from prefrl.evaluate.policies import evaluation
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
-from prefrl.policies.rollout import (
-    Rollout,
-    control,
-    cut,
-    evaluation,
-    first_rollout,
-    step_rewards,
-    whole_episodes,
-)
+from prefrl.policies.rollout import Rollout, control, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, Store, Task
+from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import draw_seed
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 

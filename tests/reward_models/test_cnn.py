@@ -15,9 +15,10 @@ from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
 from prefrl.judgements import Comparison, Judged
-from prefrl.policies.rollout import Rollout, collect, cut
+from prefrl.policies.rollout import Rollout, collect
 from prefrl.reward_models.cnn import CNN, CNNSettings
 from prefrl.reward_models.steps import StepReward
+from prefrl.sample.segments import cut
 from prefrl.types import Floats, Query, Segment, gold_score
 
 IMAGE = (8, 6, 2)
