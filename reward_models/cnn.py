@@ -17,8 +17,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
-from prefrl.reward_models.network import CACHED, uniform
-from prefrl.reward_models.steps import StepReward, control, each_input
+from prefrl.reward_models.steps import CACHED, StepReward, control, each_input, uniform
 from prefrl.seeding import draw_seed
 
 

@@ -14,8 +14,7 @@ from torch import Tensor
 from prefrl.components import ConfigError, Settings, feature_functions, suggest
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED, Describe, input_width
-from prefrl.reward_models.steps import StepReward, control
+from prefrl.reward_models.steps import CACHED, Describe, StepReward, control, input_width
 from prefrl.types import Floats
 
 STEPS = 200

@@ -14,9 +14,8 @@ from torch import Tensor
 from prefrl.components import Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import uniform
 from prefrl.reward_models.perceptron import Activation, perceptrons
-from prefrl.reward_models.steps import StepReward, control
+from prefrl.reward_models.steps import StepReward, control, uniform
 from prefrl.seeding import draw_seed
 
 

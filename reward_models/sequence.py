@@ -14,8 +14,7 @@ from torch.nn.functional import gelu, layer_norm, scaled_dot_product_attention
 from prefrl.components import ConfigError, Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED, uniform
-from prefrl.reward_models.steps import StepReward, control
+from prefrl.reward_models.steps import CACHED, StepReward, control, uniform
 from prefrl.seeding import draw_seed
 
 

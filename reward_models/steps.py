@@ -5,7 +5,9 @@ A network is small: it maps normalised steps to outputs, E members at once. All 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -14,12 +16,67 @@ from torch import Tensor
 from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble, combine
-from prefrl.reward_models.history import looking_back
-from prefrl.reward_models.network import CACHED, Describe, Measure, Network, Solve, input_width
 from prefrl.types import Floats, Segment, State
 
+CACHED = 4096
+"""Steps of all members that go through a network at once, where it makes about a hundred numbers of each."""
+
+Measure: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""(S, I) steps -> the mean (I,) and std (I,) that inputs are normalised by."""
+Solve: TypeAlias = Callable[[Tensor, Tensor, Callable[[Tensor], Tensor]], None]
+"""Fit a network without descent: normalised inputs (N, T, I), what a step counts in a score (N, T), the fit's loss."""
+
+Describe: TypeAlias = Callable[[Floats, Floats], Floats]
+"""(S, O) observations and (S, A) actions -> (S, d) hand-made features, a network's inputs in their place."""
 NUMBERS = 4_194_304
 """In the inputs that go through a network at once."""
+
+
+class Network(Protocol):
+    """E members evaluated in one pass."""
+
+    @property
+    def members(self) -> int: ...
+
+    @property
+    def memory(self) -> int:
+        """How many steps an output looks at, its own included."""
+
+    @property
+    def most(self) -> int:
+        """How many steps go through at once, at most: what is made of them stays in cache."""
+
+    def named(self) -> Mapping[str, Tensor]:
+        """Everything that is saved. What is a parameter is fitted by descent."""
+
+    def outputs(self, inputs: Tensor) -> Tensor:
+        """(B, T, I) normalised steps, T <= memory (or any where memory is 1), or (E, B, T, I), each member's own.
+
+        Returns (E, B, T). No step sees a later one.
+        """
+
+    @property
+    def first(self) -> tuple[Tensor, Tensor] | None:
+        """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+
+
+def input_width(task: ControlTask, describe: Describe | None) -> int:
+    """I: how many numbers a network sees of a step. Raises `ConfigError` for features that are not of steps."""
+    if describe is None:
+        return task.observation_size + task.action_size
+    observation, action = (np.zeros((1, size), np.float32) for size in (task.observation_size, task.action_size))
+    found = np.asarray(describe(observation, action))
+    if found.ndim != 2 or len(found) != 1 or not found.size or found.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"hand-made features: expected (S, d) real numbers for {observation.shape} observations and {action.shape} "
+            f"actions, got {found.dtype} of shape {found.shape}"
+        )
+    return int(found.shape[1])
+
+
+def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:
+    """torch.nn.Linear's default start: uniform within 1 / sqrt(fan in)."""
+    return torch.nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) / math.sqrt(fan_in))
 
 
 class StepReward:
@@ -294,3 +351,39 @@ def _sums(steps: Floats, starts: np.ndarray) -> Floats:
     """(..., S) values of the steps of N candidates that start there -> (..., N)."""
     sums: Floats = np.add.reduceat(steps, starts, -1)
     return sums
+
+
+def looking_back(
+    outputs: Callable[[Tensor], Tensor], inputs: Tensor, begins: np.ndarray, memory: int, most: int
+) -> Tensor:
+    """(E, S) outputs for steps (S, I) of episodes that start where `begins` (S,) says; the first step starts one.
+
+    `outputs` maps (B, T, I), T <= memory, to (E, B, T) and lets no step see a later one. An episode's first `memory`
+    steps are one row; each later step is the last of a row of its own. About `most` steps go through at once.
+    """
+    start, length, new = windows(begins, memory)
+    found, places = list[Tensor](), list[np.ndarray]()
+    rows = max(1, most // memory)
+    for i in range(0, len(start), rows):
+        part = slice(i, i + rows)
+        at = np.arange(length[part].max())
+        steps = np.minimum(start[part, None] + at, len(inputs) - 1)  # what lies beyond a row's end is not taken
+        taken = (at < length[part, None]) & (at >= (length - new)[part, None])
+        found.append(outputs(inputs[torch.from_numpy(steps)])[:, torch.from_numpy(taken)])
+        places.append(steps[taken])
+    return torch.cat(found, 1)[:, torch.from_numpy(np.concatenate(places).argsort())]
+
+
+def windows(begins: np.ndarray, memory: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of at most `memory` steps that show each step once with all it may see.
+
+    Returns where each row starts (W,), its length (W,), and of how many of its last steps the output is new (W,).
+    """
+    at = np.arange(len(begins))
+    heads = np.flatnonzero(begins | (at == 0))
+    ends = np.append(heads[1:], len(begins))
+    age = at - np.repeat(heads, ends - heads)
+    late = np.flatnonzero(age >= memory)
+    length = np.concatenate([np.minimum(ends - heads, memory), np.full(len(late), memory)])
+    new = np.concatenate([length[: len(heads)], np.ones(len(late), np.int64)])
+    return np.concatenate([heads, late - memory + 1]), length, new

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.formula import text_formula
-from prefrl.improve.text import TextLearner, TextSettings, advantages_of
+from prefrl.improve.text import TextLearner, TextSettings, advantages_of, text_formula
 from prefrl.policies.language import Responses, check_head
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
