@@ -34,7 +34,8 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from prefrl.config import Config
-from prefrl.exchange.formats import Which, read_judgements
+from prefrl.exchange.formats import read_judgements
+from prefrl.exchange.layout import Which
 from prefrl.fit.metrics import accuracy
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings

@@ -17,7 +17,7 @@ from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.grade import Subject, discount_of, grade, habits, judgements, of_run
 from prefrl.evaluate.summary import read_metrics
-from prefrl.exchange.formats import Which
+from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
@@ -168,7 +168,7 @@ def export_classifier(saved: Path, to: Path) -> float:
     reward = found.reward(settings.task.build())
     if not isinstance(reward, TransformerReward):
         raise RunError(f"{saved} holds a reward of kind {settings.reward.kind!r}: only 'transformer' is a classifier")
-    return save_classifier(reward, to)
+    return save_classifier(reward.backbone, *reward.mean_head(), to)
 
 
 def with_reward(config: Config, saved: Path) -> Config:
@@ -236,7 +236,7 @@ def _fits(model: Path) -> list[dict[str, Any]]:
 
 def _write_rewardbench(subject: Subject, folder: Path) -> None:
     """Every pair in which one response is preferred, with the scores of both."""
-    from prefrl.reward_models.io import ScoredPair, write_rewardbench
+    from prefrl.exchange.rewardbench import ScoredPair, write_rewardbench
 
     pairs, rows = batch(subject.judged), []
     if not all(isinstance(c, Response) for c in pairs.candidates):

@@ -1,15 +1,11 @@
-"""Reward models as others keep them: sequence classifiers of transformers, and the files of RewardBench."""
+"""Reward models as others keep them: sequence classifiers of transformers."""
 
 from __future__ import annotations
 
 import copy
-import json
-import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 from transformers import AutoModelForSequenceClassification, PreTrainedModel, PreTrainedTokenizerBase
 
@@ -25,36 +21,34 @@ from prefrl.reward_models.backbone import (
     quiet,
 )
 from prefrl.reward_models.packing import ATTENTION
-from prefrl.reward_models.text import TransformerReward, TransformerSettings
-from prefrl.storage.files import whole_folder, write_file
+from prefrl.storage.files import whole_folder
 
 PAD = "<|pad|>"
 """Added to a tokenizer whose padding could be taken for the end of a response."""
 
 
 def load_classifier(
-    name: str, task: TextTask, settings: TransformerSettings, rng: np.random.Generator
-) -> TransformerReward:
-    """A reward model of one member from an `AutoModelForSequenceClassification` checkpoint: its scores are its logits.
+    name: str, task: TextTask, download: bool, chat_template: bool | None
+) -> tuple[Backbone, torch.nn.Linear]:
+    """The backbone and the head (1, d) of an `AutoModelForSequenceClassification` checkpoint; its logits are the score.
 
-    Raises `ConfigError` unless it has one label, and is a causal model with one linear head on the last token or an
-    encoder that ends in one linear layer, whatever it has before that.
+    `chat_template`: whether it reads by one; None where its tokenizer decides. Raises `ConfigError` unless it has one
+    label, and is a causal model with one linear head on the last token or an encoder that ends in one linear layer,
+    whatever it has before that.
     """
-    model: Any = load_weights(AutoModelForSequenceClassification, name, settings.download)
+    model: Any = load_weights(AutoModelForSequenceClassification, name, download)
     if model.config.num_labels != 1:
         raise ConfigError(f"{name} tells {model.config.num_labels} labels apart; a reward model has num_labels=1")
-    path, tokenizer = _last_layer(model, name), load_tokenizer(name, settings.download)
+    path, tokenizer = _last_layer(model, name), load_tokenizer(name, download)
     head, alone = model.get_submodule(path), _logit(model) if is_encoder(model) else None
-    chat = tokenizer.chat_template is not None if settings.chat_template is None else settings.chat_template
+    chat = tokenizer.chat_template is not None if chat_template is None else chat_template
     backbone = of_classifier(model, path, tokenizer, task, chat)
     if alone is not None and not torch.allclose(_padded_logit(backbone, head), alone, rtol=1e-4, atol=1e-5):
         raise ConfigError(
             f"{name}: the score of a {type(model).__name__} hangs on padding, or is not what its last linear layer "
             f"`{path}` says; use it as a backbone"
         )
-    reward = TransformerReward(settings, backbone, rng)
-    reward.start_from(head)
-    return reward
+    return backbone, head
 
 
 def _last_layer(model: Any, name: str) -> str:
@@ -88,14 +82,13 @@ def _padded_logit(backbone: Backbone, head: torch.nn.Module) -> torch.Tensor:
     return found[:1]
 
 
-def save_classifier(reward: TransformerReward, folder: Path) -> float:
+def save_classifier(backbone: Backbone, weight: torch.Tensor, constant: float, folder: Path) -> float:
     """Write a reward model as an `AutoModelForSequenceClassification` checkpoint with its tokenizer.
 
-    Its logit is the mean of the members after shift and scale, less a constant where such heads have no bias, as those
-    of causal models; the constant is returned. Adapters are merged. A chat template is written only if the model reads
-    by it. Raises ValueError for an encoder that did not come from a checkpoint.
+    Its logit is the head's, `features @ weight` (d,) plus a constant, less that constant where such heads have no bias,
+    as those of causal models; what is missing is returned. Adapters are merged. A chat template is written only if the
+    model reads by it. Raises ValueError for an encoder that did not come from a checkpoint.
     """
-    backbone, (weight, constant) = reward.backbone, reward.mean_head()
     if backbone.pool not in ("last", "own"):
         raise ValueError(
             f"a {backbone.model.config.model_type} is an encoder, whose classifiers have deeper heads than ours: only "
@@ -154,44 +147,3 @@ def _give_padding(model: Any, tokenizer: PreTrainedTokenizerBase) -> None:
         if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:
             model.resize_token_embeddings(len(tokenizer), mean_resizing=False)
     model.config.pad_token_id = tokenizer.pad_token_id
-
-
-class ScoredPair(NamedTuple):
-    """One row of a benchmark: two texts, the better one first, and what a reward model says of them."""
-
-    id: int
-    subset: str
-    text_chosen: str
-    text_rejected: str
-    score_chosen: float
-    score_rejected: float
-
-
-def write_rewardbench(folder: Path, model: str, rows: Sequence[ScoredPair], chat: bool = False) -> dict[str, float]:
-    """Write scores as RewardBench (Lambert et al. 2024) keeps its results; returns each subset's accuracy.
-
-    `eval-set-scores/MODEL.json` has a list for each column, `eval-set/MODEL.json` the accuracies; a tie is an error.
-    `chat`: the texts were scored in the chat template of the model's tokenizer.
-    Raises ValueError for a score that is not finite, and where there are no rows.
-    """
-    path = f"{model}.json"
-    if not rows or not model or ".." in Path(path).parts or Path(path).is_absolute():
-        raise ValueError(f"expected a model's name and at least one row, got {model!r} and {len(rows)} rows")
-    if bad := [r.id for r in rows if not (math.isfinite(r.score_chosen) and math.isfinite(r.score_rejected))]:
-        raise ValueError(f"RewardBench row {bad[0]}: expected finite scores, got NaN or infinity")
-    about = {"model": model, "model_type": "Seq. Classifier", "chat_template": "tokenizer" if chat else "none"}
-    right = [int(r.score_chosen > r.score_rejected) for r in rows]
-    subsets = sorted({r.subset for r in rows})
-    accuracy = {s: float(np.mean([c for r, c in zip(rows, right, strict=True) if r.subset == s])) for s in subsets}
-    _write_json(folder / "eval-set-scores" / path, about | _columns(rows) | {"results": right})
-    _write_json(folder / "eval-set" / path, about | accuracy)
-    return accuracy
-
-
-def _columns(rows: Sequence[ScoredPair]) -> dict[str, list[Any]]:
-    names = ("id", "subset", "text_chosen", "text_rejected", "scores_chosen", "scores_rejected")
-    return {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_file(path, json.dumps(content, indent=4, sort_keys=True).encode())

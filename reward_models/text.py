@@ -63,7 +63,10 @@ class TransformerSettings(Settings):
         if self.checkpoint:
             from prefrl.reward_models.io import load_classifier
 
-            return load_classifier(self.checkpoint, _text(task), self, rng)
+            backbone, head = load_classifier(self.checkpoint, _text(task), self.download, self.chat_template)
+            reward = TransformerReward(self, backbone, rng)
+            reward.start_from(head)
+            return reward
         if self.backbone:
             backbone = of_folder(self.backbone, _text(task), self.download, self.pool, bool(self.chat_template))
         else:

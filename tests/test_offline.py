@@ -13,7 +13,7 @@ import yaml
 from prefrl import Config
 from prefrl.config import presets
 from prefrl.envs.texts import Texts, TextsSettings
-from prefrl.exchange.formats import Which
+from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.trainer import NothingToFit
 from prefrl.judgements import Ranking

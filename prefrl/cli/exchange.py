@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from prefrl.exchange.formats import Layout, Which
+    from prefrl.exchange.layout import Layout, Which
     from prefrl.exchange.ports import Imported
     from prefrl.store import Store
 
@@ -111,7 +111,7 @@ def import_(
 ) -> None:
     """Read judgements from files into a store, all or none."""
     from prefrl.cli.console import say
-    from prefrl.exchange.formats import Layout, Which
+    from prefrl.exchange.layout import Layout, Which
 
     layout = Layout.of(form.value, map_, skip_bad)
     done = (_try if dry_run else _import)(path, out, Which.of(labelers, split), layout)

@@ -133,7 +133,7 @@ def fit(
     """Fit a reward model on judgements, and save it."""
     from prefrl import stages
     from prefrl.cli.console import console, metrics_table, say
-    from prefrl.exchange.formats import Which
+    from prefrl.exchange.layout import Which
 
     settings = _load(stages.config_of(source, config), overrides)
     fitted, notes = stages.fit_reward(settings, source, out, Which.of(labelers, split))
@@ -181,7 +181,7 @@ def evaluate(
     """Evaluate the newest policy of a run, or grade a reward model."""
     from prefrl import stages
     from prefrl.cli.console import card_table, console, metrics_table
-    from prefrl.exchange.formats import Which
+    from prefrl.exchange.layout import Which
 
     if reward is not None:
         card = stages.report_card(reward, data, held_out, rewardbench, Which.of(labelers, split))

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefrl.exchange.formats import Layout, Parts, Row
+from prefrl.exchange.layout import Layout, Parts, Row
 from prefrl.exchange.reading import list_files, refuse_links
 from prefrl.exchange.text_rows import text_rows
 from prefrl.storage.log import has_store

@@ -7,82 +7,18 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
+from prefrl.exchange.layout import Layout, Parts, Row, Which
 from prefrl.exchange.reading import TABLES, list_files
-from prefrl.judgements import Answer, Judged, Skip, person
-from prefrl.types import Query
+from prefrl.judgements import Judged, Skip, person
 
 SHOWN_ERRORS = 20
 SHOWN_REPEATS = 5
 HUMAN, SCRIPT = "human", "script"
-
-
-class Row(NamedTuple):
-    """One answer of a file."""
-
-    query: Query[Any]
-    answer: Answer
-    """Its labeler is "" where the file names none."""
-    split: str = ""
-    """The part of the data that the file puts it into; "" where it says nothing."""
-    named: str = ""
-    """The query of a store that it was written from; "" where the file names none."""
-    there: str = ""
-    """Its labeler, numbered among the answers to the query that is named."""
-
-    @property
-    def judged(self) -> Judged[Any]:
-        """The judgement; for rows that are no skip."""
-        if isinstance(self.answer, Skip):
-            raise ValueError("a skip is no judgement")
-        return Judged(self.query, self.answer)
-
-
-Parts: TypeAlias = Iterable[tuple[str, Callable[[], Sequence[Row | str]]]]
-"""(place, parse): where a part of a file stands, and what reads it: answers, and reasons for leaving some out."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How the rows of a file are to be read."""
-
-    form: str = "auto"
-    """Which of `text_rows.FORMS` they have; "auto" looks at each row's columns."""
-    columns: tuple[tuple[str, str], ...] = ()
-    """(ours, the file's): which of its columns are to be read as what; when given, nothing else is read."""
-    skip_bad: bool = False
-    """Leave bad rows out, and tell of them, instead of refusing the file."""
-
-    @classmethod
-    def of(cls, form: str = "auto", columns: str = "", skip_bad: bool = False) -> Layout:
-        """From names as `prompt=question,chosen=better,rejected=worse`."""
-        pairs = [pair.partition("=") for pair in columns.split(",") if pair.strip()]
-        if bad := ["".join(pair) for pair in pairs if not (pair[0].strip() and pair[2].strip())]:
-            raise ValueError(f"expected columns as prompt=question,chosen=better, got {bad[0]!r}")
-        return cls(form, tuple((ours.strip(), theirs.strip()) for ours, _, theirs in pairs), skip_bad)
-
-
-@dataclass(frozen=True)
-class Which:
-    """Which judgements of a source count."""
-
-    labelers: tuple[str, ...] = ()
-    """By whom; everybody when empty."""
-    split: str = ""
-    """Of which part of a file, "train" or "eval" say; all when empty."""
-
-    @classmethod
-    def of(cls, labelers: str, split: str) -> Which:
-        """From names that are separated by commas."""
-        return cls(tuple(name.strip() for name in labelers.split(",") if name.strip()), split)
-
-    def takes(self, labeler: str) -> bool:
-        """Whether a labeler's judgements count; "human#2" gave the second judgement of "human" on the same query."""
-        return not self.labelers or person(labeler) in self.labelers
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.exchange.formats import Parts, Row
+from prefrl.exchange.layout import Parts, Row, answer_of
 from prefrl.exchange.reading import parse_json, read_lines, refuse_links
-from prefrl.exchange.row_answers import answer_of
 from prefrl.types import Segment
 
 LABELS = "labels.jsonl"

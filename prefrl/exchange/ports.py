@@ -16,7 +16,8 @@ from prefrl.exchange.exports.minari import export_minari
 from prefrl.exchange.exports.rows import export_judgements, export_preferences, export_unpaired
 from prefrl.exchange.exports.table import export_csv
 from prefrl.exchange.exports.tools import export_arena, export_argilla, export_label_studio
-from prefrl.exchange.formats import Layout, Row, Which, check_file
+from prefrl.exchange.formats import check_file
+from prefrl.exchange.layout import Layout, Row, Which
 from prefrl.exchange.recognition import recognised
 from prefrl.judgements import Answer
 from prefrl.storage.arrivals import Against, otherwise

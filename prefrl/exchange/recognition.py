@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sql
 
 from prefrl.exchange.exports.given import stored_queries
-from prefrl.exchange.formats import Row
+from prefrl.exchange.layout import Row
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.tables import query as asked
 from prefrl.types import Candidate, Query, Response, Segment

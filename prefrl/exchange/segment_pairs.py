@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.exchange.formats import Parts, Row
+from prefrl.exchange.layout import Parts, Row
 from prefrl.judgements import Comparison
 from prefrl.types import Query, Segment
 

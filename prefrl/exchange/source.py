@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from prefrl.exchange.formats import Which
+from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.judgements import Judged, person
 from prefrl.storage.projection import ANSWERS

@@ -19,10 +19,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefrl.exchange.formats import Layout, Parts, Row
 from prefrl.exchange.guard import unguarded
+from prefrl.exchange.layout import (
+    VERDICTS,
+    Layout,
+    Parts,
+    Row,
+    answer_of,
+    answered,
+    comparison,
+    number,
+    optional,
+    responses,
+)
 from prefrl.exchange.reading import Line, parse_json, read_rows
-from prefrl.exchange.row_answers import VERDICTS, answer_of, answered, comparison, number, optional, responses
 from prefrl.exchange.transcripts import (
     CUE,
     SPEAKERS,

@@ -7,8 +7,7 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from prefrl.exchange.formats import Row
-from prefrl.exchange.row_answers import answer_of, optional, responses
+from prefrl.exchange.layout import Row, answer_of, optional, responses
 from prefrl.exchange.transcripts import read_messages, split_conversations
 
 PROMPTS = ("prompt", "instruction", "question", "input")

@@ -10,7 +10,7 @@ import pytest
 from stores import fill, seal
 
 from prefrl.exchange.bundles import export_bundle, import_bundle
-from prefrl.exchange.formats import Layout
+from prefrl.exchange.layout import Layout
 from prefrl.exchange.ports import import_judgements, try_import
 from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.storage import log

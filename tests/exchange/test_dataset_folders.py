@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from prefrl.exchange.formats import Which, read_judgements
+from prefrl.exchange.formats import read_judgements
+from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.store import Store
 from prefrl.types import Response

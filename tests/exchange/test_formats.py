@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prefrl.exchange.formats import Which, read_judgements
+from prefrl.exchange.formats import read_judgements
+from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.exchange.text_rows import parse
 from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from prefrl.exchange.formats import Layout, Row, read_judgements
+from prefrl.exchange.formats import read_judgements
+from prefrl.exchange.layout import Layout, Row
 from prefrl.exchange.ports import import_judgements, try_import
 from prefrl.exchange.text_rows import parse
 from prefrl.judgements import Comparison, Rating, Skip

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from prefrl.exchange.formats import Layout, Row
+from prefrl.exchange.layout import Layout, Row
 from prefrl.exchange.text_rows import form_of, parse
 from prefrl.exchange.tool_rows import user_id
 from prefrl.judgements import Choice, Comparison, Ranking, Skip

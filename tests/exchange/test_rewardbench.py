@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from prefrl.reward_models.io import ScoredPair, write_rewardbench
+from prefrl.exchange.rewardbench import ScoredPair, write_rewardbench
 
 
 def test_rewardbench_files_have_its_columns_and_count_ties_as_errors(tmp_path: Path) -> None:
