@@ -62,9 +62,9 @@ TABLE: dict[Role, dict[str, str]] = {
         "transformer": "prefrl.reward_models.text:TransformerSettings",
     },
     "learners": {
-        "ppo": "prefrl.improve.control:PPOSettings",
+        "ppo": "prefrl.improve.control:ControlLearnerSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
-        "text": "prefrl.improve.text:TextSettings",
+        "text": "prefrl.improve.text:TextLearnerSettings",
     },
     "selectors": {
         "uniform": "prefrl.sample.select:UnscoredSettings",

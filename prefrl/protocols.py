@@ -6,7 +6,7 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -236,6 +236,38 @@ class StepRewardModel(RewardModel[Segment], Protocol):
         """How many steps a reward looks at: 1 where it hangs on its own step alone."""
 
 
+class Inputs(Protocol):
+    """What a policy reads of B sequences of at most L steps: tokens of responses, or decisions and what was seen."""
+
+    @property
+    def mask(self) -> torch.Tensor:
+        """(B, L) bool: the real steps."""
+
+    def rows(self, at: torch.Tensor) -> Self:
+        """Some sequences, cut to the longest of them."""
+
+    def lengths(self) -> torch.Tensor:
+        """(B,) how much each sequence costs to go through, context included."""
+
+
+I = TypeVar("I", bound=Inputs)  # noqa: E741
+I_contra = TypeVar("I_contra", bound=Inputs, contravariant=True)
+
+
+class Policy(Protocol[I_contra]):
+    """What a policy gradient improves: it can say how probable its choices were."""
+
+    def parameters(self) -> Iterable[torch.nn.Parameter]:
+        """Everything that learns, the critic included."""
+
+    def log_prob(self, inputs: I_contra) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(B, L) log-probabilities of what was chosen, differentiable, and (B, L) entropies in nats where they come
+        cheap; 0 on padding."""
+
+    def values(self, inputs: I_contra) -> torch.Tensor:
+        """(B, L) what the critic expects from each step on. Raises `ValueError` where there is no critic."""
+
+
 class Learner(Protocol[C]):
     """A policy that samples candidates, and gets better at good ones."""
 
@@ -268,8 +300,10 @@ __all__ = [
     "Attended",
     "ControlTask",
     "Environments",
+    "Inputs",
     "Labeler",
     "Learner",
+    "Policy",
     "RewardModel",
     "Selector",
     "StepRewardModel",

@@ -20,41 +20,38 @@ MAX_LOG_RATIO = 20.0
 # --- Masked statistics ------------------------------------------------------------------------------------------
 
 
+def masked_sum(x: Tensor, mask: Tensor) -> Tensor:
+    """The sum over real steps. Padding may hold anything, NaN included."""
+    return torch.where(mask.bool(), x, 0.0).sum()
+
+
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """The mean over real steps; 0 where there are none. Padding may hold anything, NaN included."""
-    return torch.where(mask.bool(), x, 0.0).sum() / mask.sum().clamp(min=1)
+    """The mean over real steps; 0 where there are none."""
+    return masked_sum(x, mask) / mask.sum().clamp(min=1)
 
 
-def masked_whiten(x: Tensor, mask: Tensor, shift_mean: bool = True, eps: float = 1e-8) -> Tensor:
-    """Scale to unit (biased) variance over real steps, and shift to mean 0 unless told not to; padding becomes 0.
-
-    Rewards are whitened with `shift_mean=False`: shifting would change the sign of sparse ones.
-    """
+def masked_whiten(x: Tensor, mask: Tensor, eps: float = 1e-8) -> Tensor:
+    """Shift and scale to mean 0 and unit (biased) variance over real steps; padding becomes 0."""
     mean = masked_mean(x, mask)
     variance = masked_mean((x - mean) ** 2, mask)
-    white = (x - mean) * torch.rsqrt(variance + eps)
-    return torch.where(mask.bool(), white if shift_mean else white + mean * torch.rsqrt(variance + eps), 0.0)
+    return torch.where(mask.bool(), (x - mean) * torch.rsqrt(variance + eps), 0.0)
 
 
-def reduce(x: Tensor, mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
-    """One number from per-step losses (B, L).
+def reduce(x: Tensor, mask: Tensor, how: Reduction, rows: int, steps: int) -> Tensor:
+    """One number from per-step losses (B, L), of a minibatch of `rows` sequences that have `steps` real steps.
 
     - token: the mean over all real steps (DAPO, PPO). Long rows weigh more.
     - sequence: the mean over rows of each row's mean (GRPO). A step of a long row weighs less.
-    - constant: the sum divided by B x constant (REINFORCE, RLOO, Dr. GRPO). No length bias: with constant = 1 the
-      gradient of the expected return itself.
+    - constant: the sum divided by the number of rows (REINFORCE, RLOO). No length bias: the gradient of the expected
+      return itself.
+
+    What the parts of a minibatch come to adds up to what the whole does.
     """
-    return (torch.where(mask.bool(), x, 0.0) * step_weights(mask, how, constant)).sum()
-
-
-def step_weights(mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
-    """(B, L): what each step counts in `reduce`; 0 on padding. With these a batch can be summed up a part at a time."""
-    real = mask.to(torch.get_default_dtype())
     if how == "token":
-        return real / real.sum().clamp(min=1)
+        return masked_sum(x, mask) / steps
     if how == "sequence":
-        return real / real.sum(1, keepdim=True).clamp(min=1) / len(real)
-    return real / (len(real) * constant)
+        return (torch.where(mask.bool(), x, 0.0).sum(1) / mask.sum(1).clamp(min=1)).sum() / rows
+    return masked_sum(x, mask) / rows
 
 
 # --- Rewards, returns, advantages -------------------------------------------------------------------------------
@@ -68,18 +65,6 @@ def step_rewards(scores: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tenso
     last = (mask.sum(1).long() - 1).clamp(min=0)
     rewards = torch.where(mask.bool(), -beta * kl, 0.0)
     return rewards.scatter_add(1, last[:, None], (scores * mask.any(1))[:, None].to(rewards.dtype))
-
-
-def returns_to_go(rewards: Tensor, mask: Tensor, discount: float = 1.0) -> Tensor:
-    """(B, L): the discounted sum of the rewards from each step on; padding is 0."""
-    rewards = torch.where(mask.bool(), rewards, 0.0)
-    if discount == 1.0:
-        return rewards.flip(1).cumsum(1).flip(1) * mask
-    running, out = torch.zeros_like(rewards[:, 0]), torch.empty_like(rewards)
-    for t in range(rewards.shape[1] - 1, -1, -1):
-        running = rewards[:, t] + discount * running
-        out[:, t] = running
-    return out * mask
 
 
 def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, discount: float, trace: float) -> Tensor:

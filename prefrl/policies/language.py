@@ -1,11 +1,13 @@
-"""Responses as tensors: sampled once, scored by forward passes, never decoded and encoded again in between."""
+"""A language model as a policy, and responses as tensors: sampled once, scored by forward passes, never decoded and
+encoded again in between."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
@@ -13,7 +15,8 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 from prefrl.components import ConfigError
 from prefrl.policies.generate import Sampling, generate
 from prefrl.protocols import Task, TextTask
-from prefrl.types import Response
+from prefrl.seeding import draw_seed
+from prefrl.types import Response, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +51,13 @@ class Responses:
         prompts, prompt_tokens = tuple(self.prompts[i] for i in chosen), tuple(self.prompt_tokens[i] for i in chosen)
         return Responses(prompts, prompt_tokens, tokens, mask, logp, self.ended[at])
 
-    def chunks(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
+    def lengths(self) -> Tensor:
+        """(B,) tokens of prompt and response together."""
+        return self.mask.sum(1) + torch.tensor([len(p) for p in self.prompt_tokens])
+
+    def parts(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
         """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
-        lengths = self.mask.sum(1) + torch.tensor([len(p) for p in self.prompt_tokens])
-        for at in lengths.argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
+        for at in self.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
             yield at, self.rows(at)
 
     def candidates(self, tokenizer: PreTrainedTokenizerBase) -> list[Response]:
@@ -64,15 +70,63 @@ class Responses:
         return found
 
 
-def respond(
-    model: PreTrainedModel, task: TextTask, prompts: Sequence[str], sampling: Sampling, generator: torch.Generator
-) -> Responses:
-    """Sample K responses to each prompt; prompts are encoded here, once, with the tokenizer's own begin token."""
-    encoded = [tuple(task.tokenizer.encode(prompt)) for prompt in prompts]
-    drawn = generate(model, encoded, sampling, generator)
-    repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(sampling.samples)]
-    texts, ids = zip(*repeated, strict=True)
-    return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
+class LanguagePolicy:
+    """A `prefrl.protocols.Policy` of `Responses`: a causal language model beside the one that it started from.
+
+    Both stay in evaluation mode throughout, so the probability ratio is 1 (to rounding) before a batch's first step.
+    `temperature` is that of sampling and of every log-probability, unless another is asked for; at most `part` rows go
+    through a network at once. Raises `ConfigError` for models whose logits are more than their head says.
+    """
+
+    def __init__(self, task: TextTask, temperature: float, part: int) -> None:
+        self.task, self.temperature, self.part = task, temperature, part
+        self.model, self.start = task.model(), task.model().requires_grad_(False)
+        check_head(self.model)
+
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return list(self.model.parameters())
+
+    def log_prob(self, inputs: Responses) -> tuple[Tensor, None]:
+        return response_logp(self.model, inputs, self.temperature), None
+
+    def values(self, inputs: Responses) -> Tensor:
+        raise ValueError("a language model without a critic has no values: set the weight of the critic's loss to 0")
+
+    def respond(
+        self, prompts: Sequence[str], samples: int, rng: np.random.Generator, temperature: float | None = None
+    ) -> Responses:
+        """Sample K responses to each prompt; prompts are encoded here, once, with the tokenizer's own begin token."""
+        tokenizer = self.task.tokenizer
+        encoded = [tuple(tokenizer.encode(prompt)) for prompt in prompts]
+        ends, temperature = (int(tokenizer.eos_token_id),), self.temperature if temperature is None else temperature
+        sampling = Sampling(samples, self.task.response_tokens, ends, temperature)
+        drawn = generate(self.model, encoded, sampling, torch.Generator().manual_seed(draw_seed(rng)))
+        repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
+        texts, ids = zip(*repeated, strict=True)
+        return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
+
+    def start_logp(self, responses: Responses, temperature: float | None = None) -> Tensor:
+        """(B, L) log-probabilities under the starting policy, without gradients."""
+        temperature = self.temperature if temperature is None else temperature
+        return all_logp(self.start, responses, temperature, self.part)
+
+    def with_gold(self, responses: Responses) -> list[Response]:
+        """As candidates, gold attached: for what is asked about, and for evaluation."""
+        found = responses.candidates(self.task.tokenizer)
+        gold = self.task.gold(found)
+        return [replace(r, gold=gold[i : i + 1]) for i, r in enumerate(found)]
+
+    def state(self) -> State:
+        return {name: p.detach().clone() for name, p in self.model.named_parameters()}
+
+    @torch.no_grad()
+    def load(self, state: State) -> None:
+        """Raises ValueError where names or shapes differ."""
+        for name, parameter in self.model.named_parameters():
+            found = state.get(name)
+            if found is None or found.shape != parameter.shape:
+                raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
+            parameter.copy_(found)
 
 
 def response_logp(model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
@@ -96,10 +150,10 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
 
 
 @torch.no_grad()
-def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, chunk: int) -> Tensor:
-    """`response_logp` without gradients, a chunk of rows at a time."""
+def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, part: int) -> Tensor:
+    """`response_logp` without gradients, a part of the rows at a time."""
     found = torch.zeros(responses.mask.shape)
-    for at, rows in responses.chunks(chunk):
+    for at, rows in responses.parts(part):
         found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)
     return found
 

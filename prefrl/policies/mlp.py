@@ -50,8 +50,31 @@ class ActionSpace:
         return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
 
 
-class Policy:
-    """An actor and a critic, each an MLP with tanh; state-independent log standard deviation for boxes.
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """B decisions, each a sequence of one step to the update."""
+
+    observations: Tensor
+    """(B, O) normalised."""
+    choices: Tensor
+    """(B, A)."""
+
+    @property
+    def mask(self) -> Tensor:
+        """(B, 1): all real."""
+        return self.choices.new_ones(len(self.choices), 1, dtype=torch.bool)
+
+    def rows(self, at: Tensor) -> Decisions:
+        return Decisions(self.observations[at], self.choices[at])
+
+    def lengths(self) -> Tensor:
+        return self.choices.new_ones(len(self.choices), dtype=torch.int64)
+
+
+class MLPPolicy:
+    """A `prefrl.protocols.Policy` of `Decisions`: an actor and a critic, each an MLP with tanh.
+
+    For boxes the log standard deviation is a parameter of its own, the same in every state.
 
     Weights are orthogonal with gains sqrt(2), 0.01 for the actor's last layer and 1 for the critic's. Acting is
     NumPy on the same weights: for networks this small torch's overhead would be most of the time.
@@ -66,8 +89,8 @@ class Policy:
         self.log_std = torch.nn.Parameter(torch.full((task.action_size,), math.log(initial_std)))
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
 
-    def actor_parameters(self) -> list[torch.nn.Parameter]:
-        return [*self.actor, *([] if self.space.discrete else [self.log_std])]
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return [*self.actor, *([] if self.space.discrete else [self.log_std]), *self.critic]
 
     def normalise(self, observations: Floats) -> Floats:
         """(..., O) -> (..., O) float32, by the statistics so far."""
@@ -106,19 +129,24 @@ class Policy:
             outputs = outputs + std * rng.standard_normal(outputs.shape, np.float32)
         return outputs, self.space.execute(outputs)
 
-    def log_prob(self, inputs: Tensor, choices: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised observations (B, O) and choices (B, A) -> log probabilities (B,) and entropies (B,), in nats."""
-        outputs = forward(self.actor, inputs)
+    def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
+        """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
+        outputs = forward(self.actor, inputs.observations)
         if self.space.discrete:
-            return (outputs.log_softmax(-1) * choices).sum(-1), categorical_entropy(outputs)
-        scaled = (choices - outputs) * (-self.log_std).exp()
+            logp = (outputs.log_softmax(-1) * inputs.choices).sum(-1, keepdim=True)
+            return logp, categorical_entropy(outputs)[:, None]
+        scaled = (inputs.choices - outputs) * (-self.log_std).exp()
         constant = self.log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
         entropy = constant + 0.5 * self.space.size
-        return -0.5 * (scaled**2).sum(-1) - constant, entropy.expand(len(inputs))
+        return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(len(outputs), 1)
 
-    def values(self, inputs: Tensor) -> Tensor:
+    def values(self, inputs: Decisions) -> Tensor:
+        """(B, 1)."""
+        return forward(self.critic, inputs.observations)
+
+    def values_of(self, observations: Tensor) -> Tensor:
         """Normalised observations (..., O) -> (...)."""
-        return forward(self.critic, inputs).squeeze(-1)
+        return forward(self.critic, observations).squeeze(-1)
 
     def state(self) -> State:
         named = {name: p.detach().clone() for name, p in self._named()}

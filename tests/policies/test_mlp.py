@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from prefrl.envs.control import ControlSettings
-from prefrl.policies.mlp import ActionSpace, Policy, categorical_entropy, forward
+from prefrl.policies.mlp import ActionSpace, Decisions, MLPPolicy, categorical_entropy, forward
 
 
-def _policy(env: str, seed: int = 0) -> Policy:
-    policy = Policy(ControlSettings(env=env, segment_steps=5).build(), (16, 16), 0.7, np.random.default_rng(seed))
+def _policy(env: str, seed: int = 0) -> MLPPolicy:
+    policy = MLPPolicy(ControlSettings(env=env, segment_steps=5).build(), (16, 16), 0.7, np.random.default_rng(seed))
     policy.observe(np.random.default_rng(2).normal(1, 3, (50, len(policy.mean))))
     return policy
 
@@ -37,10 +37,10 @@ def test_numpy_acts_as_torch_would(env: str) -> None:
 def test_densities_and_entropies_are_those_of_torch_distributions() -> None:
     policy = _policy("Pendulum-v1")
     inputs, choices = torch.randn(7, 3), torch.randn(7, 1)
-    logp, entropy = policy.log_prob(inputs, choices)
+    logp, entropy = policy.log_prob(Decisions(inputs, choices))
     normal = torch.distributions.Normal(forward(policy.actor, inputs), policy.log_std.exp())
-    torch.testing.assert_close(logp, normal.log_prob(choices).sum(1))  # type: ignore[no-untyped-call]
-    torch.testing.assert_close(entropy, normal.entropy().sum(1))  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(logp, normal.log_prob(choices))  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(entropy, normal.entropy())  # type: ignore[no-untyped-call]
 
 
 def test_categorical_choices_follow_their_probabilities() -> None:
@@ -48,7 +48,7 @@ def test_categorical_choices_follow_their_probabilities() -> None:
     policy.actor[-1].data = torch.tensor([0.0, 1.5])
     observations = np.tile(np.array([0.1, 0.2, 0.0, -0.1], np.float32), (20_000, 1))
     choices, actions = policy.act(observations, np.random.default_rng(0))
-    logp, entropy = policy.log_prob(torch.from_numpy(policy.normalise(observations[:2])), torch.eye(2))
+    logp, entropy = policy.log_prob(Decisions(torch.from_numpy(policy.normalise(observations[:2])), torch.eye(2)))
     assert choices is actions
     assert choices.mean(0)[0] == pytest.approx(float(logp.detach()[0].exp()), abs=0.01)
     assert float(entropy.detach()[0]) == pytest.approx(-float((logp.exp() * logp).detach().sum()), abs=1e-5)
@@ -62,7 +62,7 @@ def test_gaussian_noise_has_the_stated_deviation_and_actions_keep_to_their_bound
 
 
 def test_the_normaliser_has_the_mean_and_variance_of_all_it_observed() -> None:
-    policy = Policy(ControlSettings(env="Pendulum-v1").build(), (4,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicy(ControlSettings(env="Pendulum-v1").build(), (4,), 1.0, np.random.default_rng(0))
     data = np.random.default_rng(0).normal(5, 2, (90, 3)).astype(np.float32)
     policy.observe(data[:20].reshape(4, 5, 3))
     policy.observe(data[20:])
