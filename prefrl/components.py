@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict
 
@@ -62,7 +62,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "transformer": "prefrl.reward_models.text:TransformerSettings",
     },
     "learners": {
-        "ppo": "prefrl.improve.control:ControlLearnerSettings",
+        "control": "prefrl.improve.control:ControlLearnerSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
         "text": "prefrl.improve.text:TextLearnerSettings",
     },
@@ -74,6 +74,8 @@ TABLE: dict[Role, dict[str, str]] = {
         "information": "prefrl.sample.select:ScoredSettings",
     },
 }
+RENAMED: dict[Role, dict[str, str]] = {"learners": {"ppo": "control"}}
+"""Kinds that had another name before: role -> old name -> today's."""
 EXTRAS = {
     "gymnasium": "control",
     "mujoco": "control",
@@ -90,6 +92,13 @@ EXTRAS = {
     "pyarrow": "interchange",
     "minari": "interchange",
 }
+
+
+def filled_in(given: Any, defaults: dict[str, dict[str, Any]]) -> Any:
+    """Settings with the defaults of their `algorithm`, the first one unless given; what is given stands."""
+    if not isinstance(given, dict):
+        return given
+    return defaults.get(given.get("algorithm", next(iter(defaults))), {}) | given
 
 
 @cache
@@ -110,6 +119,8 @@ def kinds(role: Role) -> list[str]:
 
 def settings_class(role: Role, kind: str) -> type[Settings]:
     """The settings class behind a kind; loads its module. Raises `ConfigError` with the nearest name."""
+    if kind not in kinds(role) and kind in RENAMED.get(role, {}):
+        raise ConfigError(f"{role[:-1]} kind {kind!r} is now called {RENAMED[role][kind]!r}")
     if kind not in kinds(role):
         raise ConfigError(f"unknown {role[:-1]} kind {kind!r}; {suggest(kind, kinds(role))}")
     try:

@@ -82,7 +82,8 @@ def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:
         ("learner.learning_rate=fast", "learner.learning_rate: expected number, got 'fast'"),
         ("fitting.weight_decay=adaptiv", "fitting.weight_decay: expected number or 'adaptive', got 'adaptiv'"),
         ("learner.learning_rate=.nan", "learner.learning_rate: expected a finite number, got nan"),
-        ("learner.kind=ppoo", "learner.kind: unknown learner kind 'ppoo'; did you mean 'ppo'?"),
+        ("learner.kind=controll", "learner.kind: unknown learner kind 'controll'; did you mean 'control'?"),
+        ("learner.kind=ppo", "learner.kind: learner kind 'ppo' is now called 'control'"),
         ("loop.lables=3", "loop.lables: unknown setting; did you mean 'labels'?"),
         ("lop.labels=3", "lop: unknown setting; did you mean 'loop'?"),
         ("task=5", "task: expected settings with a kind"),
@@ -120,7 +121,7 @@ def test_an_unknown_preset_gets_the_nearest_name() -> None:
         ("task: [", "not valid YAML"),
         ("just words", "expected settings"),
         ("task: !!python/object/apply:os.system ['true']", "not valid YAML"),
-        ("task: {kind: 'os:system'}\nreward: {kind: mlp}\nlearner: {kind: ppo}", "unknown task kind"),
+        ("task: {kind: 'os:system'}\nreward: {kind: mlp}\nlearner: {kind: control}", "unknown task kind"),
     ],
 )
 def test_a_bad_file_is_refused_and_runs_no_code(tmp_path: Path, text: str, message: str) -> None:

@@ -25,7 +25,7 @@ TOY = {
     "task": {"kind": "point"},
     "reward": {"kind": "mlp", "members": 1, "hidden": [8]},
     "fitting": {"epochs": 100, "learning_rate": 0.01},
-    "learner": {"kind": "ppo"},
+    "learner": {"kind": "control"},
 }
 OFFLINE = [name for name in presets() if not Config.load(name).loop.labels]
 

@@ -1,17 +1,22 @@
-"""Our own policy gradients for control: REINFORCE with a baseline ... PPO, on the learned reward."""
+"""Our own policy gradients for control, on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
+
+Variant: PPO's clip with GAE (Schulman et al. 2016, 2017), advantages whitened over the rollout, a learning rate steered
+by the KL in place of early stopping, and extra epochs for the critic after each fit of the reward. Values are not
+clipped; actor and critic share nothing but the observation normaliser.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from prefrl.components import Settings
+from prefrl.components import Settings, filled_in
 from prefrl.evaluate.policies import evaluation
 from prefrl.improve.gradient import Batch, Objective, adam, steer, update
 from prefrl.improve.objectives import gae, masked_whiten
@@ -21,12 +26,21 @@ from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, T
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "a2c": {"clip": None, "epochs": 1, "trace": 1.0, "rollout_steps": 16, "target_kl": None},
+    "reinforce": {"clip": None, "epochs": 1, "trace": 1.0},
+}
+"""Where their defaults are others than those of the fields below."""
+
 
 class ControlLearnerSettings(Settings):
-    """Policy gradients on the learned reward: PPO (Schulman et al. 2017); with clip=null, epochs=1 and trace=1 it is
-    REINFORCE with a learned baseline."""
+    """Our own policy gradients on the learned reward: PPO by default, A2C or REINFORCE with a learned baseline."""
 
-    kind: Literal["ppo"] = "ppo"
+    kind: Literal["control"] = "control"
+    algorithm: Literal["ppo", "a2c", "reinforce"] = "ppo"
+    """What fills in the defaults: ppo (Schulman et al. 2017); a2c (Mnih et al. 2016), short rollouts and one step on
+    each; reinforce (Williams 1992), whole returns. Anything that is set beside it stands."""
     environments: int = Field(16, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
@@ -61,6 +75,11 @@ class ControlLearnerSettings(Settings):
     """Of the actions' noise at the start, in units of half the action bounds."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")
     def _whole_steps(self) -> ControlLearnerSettings:

@@ -1,18 +1,23 @@
-"""Policy gradients for text, on the learned reward: RLOO by default; REINFORCE, GRPO and PPO's clip are settings."""
+"""Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE.
+
+Variant: one advantage a response, no critic; the KL of each token is taken off the reward before the baseline (k1), or
+added to the loss (k2); the penalty for a missing end comes before the baseline too. GRPO as published puts k3 into the
+loss, whose gradient is that of the other direction.
+"""
 
 from __future__ import annotations
 
 import copy
 from collections import defaultdict
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from prefrl.components import Settings
+from prefrl.components import Settings, filled_in
 from prefrl.evaluate.policies import responses
 from prefrl.improve.gradient import Batch, Objective, adam, update
 from prefrl.improve.objectives import AdaptiveKL, Reduction, group_normalised, kl_k1, leave_one_out, step_rewards
@@ -21,11 +26,21 @@ from prefrl.protocols import RewardModel, Store, Task, TextTask
 from prefrl.seeding import draw_seed
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
 
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "rloo": {},
+    "grpo": {"advantage": "group_normalised", "clip": 0.2, "kl_in": "loss", "reduction": "sequence"},
+    "reinforce": {"advantage": "batch_mean"},
+}
+"""Where their defaults are others than those of the fields below."""
+
 
 class TextLearnerSettings(Settings):
     """Policy gradients on a learned reward, held near the starting policy by a KL penalty; RLOO by default."""
 
     kind: Literal["text"] = "text"
+    algorithm: Literal["rloo", "grpo", "reinforce"] = "rloo"
+    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with k2 as the KL), or reinforce
+    (Williams 1992) with the batch's mean as its baseline. Anything that is set beside it stands."""
     updates: int = Field(15, ge=1)
     """Batches of a round."""
     prompts: int = Field(16, ge=1)
@@ -65,6 +80,11 @@ class TextLearnerSettings(Settings):
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=1)
     """Rows in one pass of a network: changes memory and speed, and nothing else but rounding."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")
     def _consistent(self) -> TextLearnerSettings:

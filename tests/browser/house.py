@@ -27,7 +27,7 @@ POINT = PointSettings(segment_steps=STEPS)
 CONFIG = f"""\
 task: {{kind: point, segment_steps: {STEPS}}}
 reward: {{kind: mlp}}
-learner: {{kind: ppo}}
+learner: {{kind: control}}
 labeler: {{kind: web, check_share: 0, repeat_share: 0}}
 """
 """Of a folder with clips: for the process that draws them, and for the command line."""

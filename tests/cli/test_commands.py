@@ -114,7 +114,7 @@ def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
         ("run control/pendulum --out run task.env=Pendulam-v1", "Pendulum-v1"),
         ("evaluate .", "holds neither a run"),
         ("fit . --out reward", "--config"),
-        ("describe pppo", "did you mean 'ppo'?"),
+        ("describe contrl", "did you mean 'control'?"),
     ],
 )
 def test_a_mistake_gets_a_line_on_stderr_and_status_two(prefrl: Shell, line: str, message: str) -> None:
@@ -164,7 +164,7 @@ def test_types_and_grouped_settings_are_told_in_words(prefrl: Shell) -> None:
 
 
 def test_learners_print_what_they_optimise(prefrl: Shell) -> None:
-    for kind in ("ppo", "text"):
+    for kind in ("control", "text"):
         assert prefrl(f"describe {kind}") == 0
         assert "what it optimises" in prefrl.out
         assert "maximise" in prefrl.out.lower()

@@ -213,3 +213,11 @@ def test_a_reward_model_without_step_rewards_is_refused(store: Store[Segment]) -
 def test_the_formula_says_what_is_optimised() -> None:
     assert "clip(r, 0.8, 1.2)" in ControlLearnerSettings().formula()
     assert "log pi(a|s) A" in ControlLearnerSettings(clip=None).formula()
+
+
+def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> None:
+    assert ControlLearnerSettings() == ControlLearnerSettings(algorithm="ppo")
+    plain = ControlLearnerSettings(algorithm="reinforce", trace=0.9)
+    assert (plain.clip, plain.epochs, plain.trace) == (None, 1, 0.9)
+    assert ControlLearnerSettings.model_validate(plain.model_dump()) == plain
+    assert ControlLearnerSettings(algorithm="a2c").rollout_steps == 16

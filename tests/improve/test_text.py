@@ -303,3 +303,11 @@ def test_the_formula_says_what_the_settings_say() -> None:
     )
     assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 (log pi(y_t) - log ref(y_t))^2 / 2" in other.formula()
     assert "ref" not in text_formula(TextLearnerSettings(beta=0.0))
+
+
+def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> None:
+    assert TextLearnerSettings() == TextLearnerSettings(algorithm="rloo")
+    grpo = TextLearnerSettings(algorithm="grpo", kl_in="reward")
+    assert (grpo.advantage, grpo.clip, grpo.kl_in, grpo.reduction) == ("group_normalised", 0.2, "reward", "sequence")
+    assert TextLearnerSettings.model_validate(grpo.model_dump()) == grpo
+    assert TextLearnerSettings(algorithm="reinforce").advantage == "batch_mean"
