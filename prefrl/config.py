@@ -7,18 +7,19 @@ from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
-from prefrl.fit.descent import trainable
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.seeding import streams
-from prefrl.store import Store
+
+if TYPE_CHECKING:
+    from prefrl.store import Store
 
 
 def _component(role: Role, default: str | None, value: object) -> Settings:
@@ -89,6 +90,8 @@ class Config(Settings):
 
     def build(self, store: Store[Any]) -> Loop[Any]:
         """Make every component, and the loop that joins them, on an open store."""
+        from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
+
         rng = streams(self.seed, 0).build
         parts: Any = self  # the settings classes are known by kind only
         task = parts.task.build()

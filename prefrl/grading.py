@@ -31,9 +31,8 @@ from prefrl.evaluate.lengths import context, length, length_part, sample
 from prefrl.evaluate.summary import read_metrics
 from prefrl.files import DamagedError
 from prefrl.fit.metrics import Answering, brier, calibration_error, log_losses, temperature
-from prefrl.fit.settings import FittingSettings
+from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.split import split
-from prefrl.fit.terms import Ties
 from prefrl.graph import compared
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Candidate, Floats, Integers, Judged, Query, Response, Segment, gold_score, person
