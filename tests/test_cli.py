@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ from shell import Shell
 from text_models import classifier, gpt2
 
 from prefrl import Config
-from prefrl.components import TABLE, kinds
+from prefrl.components import TABLE, kinds, plugins
 from prefrl.console import interrupts
 from prefrl.envs.text import Reviews
+from prefrl.improve.control import PPOSettings
+from prefrl.improve.text import TextSettings
 from prefrl.store import Store
 from prefrl.types import Query, Ranking, Segment
 
@@ -185,10 +188,24 @@ def test_types_and_grouped_settings_are_told_in_words(prefrl: Shell) -> None:
         assert "Annotated" not in prefrl.out
 
 
+def test_the_kinds_of_installed_packages_are_described_by_their_classes(
+    prefrl: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    point = EntryPoint("mine", "prefrl.envs.toys:PointSettings", "prefrl.tasks")
+    monkeypatch.setattr("prefrl.components.entry_points", lambda group: [point] if group == "prefrl.tasks" else [])
+    plugins.cache_clear()
+    try:
+        assert prefrl("describe mine") == 0
+        assert "Steps of a judged segment." in prefrl.out
+    finally:
+        plugins.cache_clear()
+
+
 def test_learners_print_what_they_optimise(prefrl: Shell) -> None:
-    for kind in ("ppo", "text"):
+    for kind, said in (("ppo", PPOSettings().formula()), ("text", TextSettings().formula())):
         assert prefrl(f"describe {kind}") == 0
         assert "what it optimises" in prefrl.out
+        assert said.splitlines()[0] in prefrl.out
         assert "maximise" in prefrl.out.lower()
 
 
@@ -198,11 +215,31 @@ def test_commands_that_only_tell_work(prefrl: Shell, line: str) -> None:
     assert len(prefrl.out) > 100
 
 
-def test_help_loads_nothing_heavy() -> None:
-    heavy = {"torch", "transformers", "gymnasium", "pydantic", "sqlalchemy"}
-    code = f"import sys, prefrl.cli; print(sorted({heavy} & set(sys.modules)))"
+def loaded(line: str, *modules: str) -> set[str]:
+    """Which of these modules a command has loaded by its end, in a process of its own."""
+    code = (
+        f"import sys; sys.argv = ['prefrl', *{line.split()}]\n"
+        f"from prefrl.cli import main\ntry: main()\nexcept SystemExit: print(*{set(modules)} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert len(done.stdout) > 100, "it said nothing"
+    return set(done.stdout.splitlines()[-1].split())
+
+
+HEAVY = ("torch", "transformers", "scipy", "sqlalchemy", "gymnasium", "stable_baselines3", "matplotlib", "starlette")
+
+
+def test_help_loads_nothing_heavy() -> None:
+    assert loaded("--help", *HEAVY, "numpy", "pydantic", "yaml") == set()
+
+
+def test_presets_are_listed_without_anything_heavy() -> None:
+    assert loaded("presets", *HEAVY) == set()
+
+
+@pytest.mark.parametrize("kind", ["ppo", "sb3", "transformer", "reviews", "judge", "web", "fitting", "loop"])
+def test_settings_are_described_without_what_they_build(kind: str) -> None:
+    assert loaded(f"describe {kind}", *HEAVY) == set()
 
 
 def test_a_control_user_never_loads_transformers(tmp_path: Path) -> None:
