@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.components import Settings
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, labeler_part, member_part
 from prefrl.evaluate.calibration import reliability
 from prefrl.evaluate.card import (
@@ -72,6 +71,7 @@ class Subject:
     known: Sequence[Segment] = ()
     """Other segments that carry gold, for the regression that stands in for it."""
     discount: float = 0.99
+    """What a reward a step later counts for in learning: shaping by a potential is told apart by it."""
     model: str = ""
     data: str = ""
     held_out: bool = False
@@ -162,11 +162,6 @@ def _gold_of(candidate: Any, store: Store[Any]) -> Floats | None:
         if isinstance(error.__cause__, FileNotFoundError):
             return None
         raise
-
-
-def discount_of(learner: Settings) -> float:
-    """The learner's own discount, where it has one."""
-    return float(learner.model_dump().get("discount", Subject.discount))
 
 
 def _segments(judged: Sequence[Judged[Any]]) -> list[Segment]:

@@ -248,6 +248,15 @@ class StepRewardModel(RewardModel[Segment], Protocol):
         """How many steps a reward looks at: 1 where it hangs on its own step alone."""
 
 
+@runtime_checkable
+class LearnerSettings(Protocol):
+    """A learner's settings, as far as others read them."""
+
+    @property
+    def discount(self) -> float:
+        """What a reward a step later counts for in learning; 1 where candidates are scored as a whole."""
+
+
 class Learner(Protocol[C]):
     """A policy that samples candidates, and gets better at good ones."""
 
@@ -282,6 +291,7 @@ __all__ = [
     "Environments",
     "Labeler",
     "Learner",
+    "LearnerSettings",
     "RewardModel",
     "Selector",
     "StepRewardModel",

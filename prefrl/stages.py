@@ -20,7 +20,7 @@ from prefrl.evaluate.report import render_card
 from prefrl.evaluate.summary import read_metrics
 from prefrl.files import check_free, read_lines, write_file
 from prefrl.fit.trainer import fit
-from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
+from prefrl.grading import Subject, grade, habits, judgements, of_run
 from prefrl.graph import batch
 from prefrl.label.formats import Which
 from prefrl.label.source import open_judgements
@@ -206,7 +206,7 @@ def report_card(
     saved = open_saved(model)
     settings: Any = saved.config
     task, fitting, rng = settings.task.build(), settings.fitting, streams(settings.seed, 0).evaluate
-    reward, discount = saved.reward(task), discount_of(settings.learner)
+    reward, discount = saved.reward(task), saved.config.discount
     source = data or model
     if data is None and not (model / "checkpoints").exists():
         raise RunError(f"{model} holds no judgements: say what to grade it on, with --data FOLDER_OR_FILE")
