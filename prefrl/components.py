@@ -34,6 +34,10 @@ class Settings(BaseModel):
         """The same without what may change from one start of a run to the next, such as a port."""
         return self
 
+    def formula(self) -> str:
+        """What a learner optimises, in plain letters; empty where there is nothing to spell out."""
+        return ""
+
     def work(self) -> float:
         """How much a round takes, in any unit: a dry run compares it with that of the shrunk settings."""
         return 1.0

@@ -7,18 +7,20 @@ from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import yaml
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
-from prefrl.fit.descent import trainable
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
+from prefrl.protocols import LearnerSettings
 from prefrl.seeding import streams
-from prefrl.store import Store
+
+if TYPE_CHECKING:
+    from prefrl.store import Store
 
 
 def _component(role: Role, default: str | None, value: object) -> Settings:
@@ -63,6 +65,11 @@ class Config(Settings):
     seed: int = Field(0, ge=0)
     """All random numbers of the run come from this one."""
 
+    @property
+    def discount(self) -> float:
+        """The learner's own."""
+        return cast(LearnerSettings, self.learner).discount
+
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:
         """Read a preset ("control/pendulum") or a YAML file, with `dotted.key=value` overrides.
@@ -89,6 +96,10 @@ class Config(Settings):
 
     def build(self, store: Store[Any]) -> Loop[Any]:
         """Make every component, and the loop that joins them, on an open store."""
+        from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
+
+        if not isinstance(self.learner, LearnerSettings):
+            raise ConfigError(f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads")
         rng = streams(self.seed, 0).build
         parts: Any = self  # the settings classes are known by kind only
         task = parts.task.build()

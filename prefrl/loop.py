@@ -15,7 +15,6 @@ from pydantic import Field
 
 from prefrl.components import Settings
 from prefrl.fit.settings import FittingSettings
-from prefrl.fit.trainer import NothingToFit, fit
 from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
 from prefrl.seeding import Streams, streams
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
@@ -135,6 +134,8 @@ class Loop(Generic[C]):
         )
 
     def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
+        from prefrl.fit.trainer import NothingToFit, fit  # torch is heavy, and who reads settings needs none
+
         with self._timed("fit"):
             try:
                 fitted = fit(self.reward, self.store, self.fitting, rng.fit, pool)

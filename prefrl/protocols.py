@@ -268,6 +268,15 @@ class Policy(Protocol[I_contra]):
         """(B, L) what the critic expects from each step on. Raises `ValueError` where there is no critic."""
 
 
+@runtime_checkable
+class LearnerSettings(Protocol):
+    """A learner's settings, as far as others read them."""
+
+    @property
+    def discount(self) -> float:
+        """What a reward a step later counts for in learning; 1 where candidates are scored as a whole."""
+
+
 class Learner(Protocol[C]):
     """A policy that samples candidates, and gets better at good ones."""
 
@@ -303,6 +312,7 @@ __all__ = [
     "Inputs",
     "Labeler",
     "Learner",
+    "LearnerSettings",
     "Policy",
     "RewardModel",
     "Selector",

@@ -16,7 +16,7 @@ import numpy as np
 from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.drift import first_judged, read_probes
-from prefrl.evaluate.grade import discount_of, grade, of_run
+from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, RewardModel, Task
@@ -95,11 +95,10 @@ class Run:
 
     def report(self) -> Path:
         """Grade the reward model where judgements were held out, write `report.html`, and say where it is."""
-        settings = self.config
-        reward, discount = self.loop.reward, discount_of(settings.learner)
-        subject = of_run(reward, self.store, self.folder, self.loop.round, settings.fitting, discount)
+        config, loop = self.config, self.loop
+        subject = of_run(loop.reward, self.store, self.folder, loop.round, config.fitting, config.discount)
         if subject is not None:
-            card = grade(subject, streams(settings.seed, 0).evaluate)
+            card = grade(subject, streams(config.seed, 0).evaluate)
             write_file(self.folder / "card.json", card.model_dump_json(indent=1).encode())
         return write_report(self.folder)
 

@@ -15,7 +15,7 @@ import numpy as np
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
-from prefrl.evaluate.grade import Subject, discount_of, grade, habits, judgements, of_run
+from prefrl.evaluate.grade import Subject, grade, habits, judgements, of_run
 from prefrl.evaluate.summary import read_metrics
 from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
@@ -206,7 +206,7 @@ def report_card(
     saved = open_saved(model)
     settings: Any = saved.config
     task, fitting, rng = settings.task.build(), settings.fitting, streams(settings.seed, 0).evaluate
-    reward, discount = saved.reward(task), discount_of(settings.learner)
+    reward, discount = saved.reward(task), saved.config.discount
     source = data or model
     if data is None and not (model / "checkpoints").exists():
         raise RunError(f"{model} holds no judgements: say what to grade it on, with --data FOLDER_OR_FILE")

@@ -73,7 +73,8 @@ def processes(folder: Path) -> list[int]:
     return [int(line.split()[1]) for line in (folder / "attempts").read_text().splitlines()]
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], bool], seconds: float = 40.0) -> None:
+    """Wait for something; fails where it does not come to pass, on a machine that does other things too."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not come to pass"

@@ -4,9 +4,12 @@ import pytest
 import yaml
 
 from prefrl import Config
-from prefrl.components import ConfigError, settings_class
+from prefrl.components import ConfigError, Settings, kinds, settings_class
 from prefrl.config import presets
+from prefrl.protocols import LearnerSettings
 from prefrl.rundir import Run
+from prefrl.store import Store
+from prefrl.types import Segment
 
 TOY = "control/toy"
 
@@ -25,6 +28,34 @@ def test_a_dumped_config_spells_out_every_default(tmp_path: Path) -> None:
     assert data["labeler"].keys() == settings_class("labelers", "oracle").model_fields.keys()
     assert data["labeler"]["mistake_rate"] == 0.0
     assert Config.load(path) == Config.load(TOY)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "discount"),
+    [
+        ("control/toy", ["learner.discount=0.8"], 0.8),
+        ("control/toy", ["learner.kind=sb3", "learner.options={gamma: 0.7}"], 0.7),
+        ("text/toy", [], 1.0),
+    ],
+)
+def test_every_kind_of_learner_says_its_discount(name: str, overrides: list[str], discount: float) -> None:
+    assert Config.load(name, overrides).discount == discount
+
+
+@pytest.mark.parametrize("kind", kinds("learners"))
+def test_every_learners_settings_fit_their_role(kind: str) -> None:
+    assert isinstance(settings_class("learners", kind)(), LearnerSettings)
+
+
+def test_a_learner_that_does_not_say_its_discount_is_refused_before_it_learns(tmp_path: Path) -> None:
+    class Silent(Settings):
+        """Settings of a learner of somebody's own."""
+
+        kind: str = "silent"
+
+    config = Config.load(TOY).model_copy(update={"learner": Silent()})
+    with Store[Segment](tmp_path) as store, pytest.raises(ConfigError, match="Silent has no `discount`"):
+        config.build(store)
 
 
 def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from importlib.resources import files
 from typing import Any
 
-from prefrl.components import TABLE, Role, settings_class
+from prefrl.components import TABLE, Role, Settings, plugins, settings_class
 from prefrl.config import Config
 
 ROLES: dict[str, Role] = {
@@ -35,6 +36,26 @@ def schema() -> dict[str, Any]:
     }
 
 
+def schema_of(cls: type[Settings]) -> dict[str, Any]:
+    """The schema of a settings class; with its defaults, a learner says what it optimises."""
+    made = cls.model_json_schema(ref_template="#/$defs/{model}")
+    if not made.get("required") and (formula := cls().formula()):
+        made["x-formula"] = formula
+    return made
+
+
+def described(role: Role, kind: str) -> dict[str, Any]:
+    """The schema of one kind's settings, with its `$defs`.
+
+    For a built-in kind it is taken from the file that is shipped: nothing is imported that the kind itself needs.
+    """
+    if kind in plugins(role):
+        return schema_of(settings_class(role, kind))
+    shipped = json.loads(files("prefrl.configs").joinpath("schema.json").read_text(encoding="utf-8"))
+    name = TABLE[role][kind].partition(":")[2]
+    return {**shipped["$defs"][name], "$defs": shipped["$defs"]}
+
+
 def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     """The schema of one top-level key."""
     if name in ROLES:
@@ -46,7 +67,7 @@ def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str,
 
 def _define(cls: Any, definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
     """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
-    made = cls.model_json_schema(ref_template="#/$defs/{model}")
+    made = schema_of(cls)
     definitions |= made.pop("$defs", {})
     if kind is not None:
         made["required"] = sorted({"kind", *made.get("required", [])})

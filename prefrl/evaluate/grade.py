@@ -10,19 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.components import Settings
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, labeler_part, member_part
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import (
-    About,
-    Calibration,
-    Estimate,
-    Gold,
-    ReliabilityBin,
-    ReportCard,
-    Scatter,
-    undefined,
-)
+from prefrl.evaluate.card import About, Calibration, Estimate, Gold, ReliabilityBin, ReportCard, Scatter, undefined
 from prefrl.evaluate.distances import distance_part
 from prefrl.evaluate.drift import drift, read_probes
 from prefrl.evaluate.intervals import clusters, correlation
@@ -31,9 +21,8 @@ from prefrl.evaluate.lengths import context, length, length_part, sample
 from prefrl.evaluate.summary import read_metrics
 from prefrl.fit.metrics import Answering, brier, calibration_error, log_losses, temperature
 from prefrl.fit.pairs import compared
-from prefrl.fit.settings import FittingSettings
+from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.split import split
-from prefrl.fit.terms import Ties
 from prefrl.judgements import Judged, person
 from prefrl.protocols import RewardModel, Store
 from prefrl.storage.files import DamagedError
@@ -74,6 +63,7 @@ class Subject:
     known: Sequence[Segment] = ()
     """Other segments that carry gold, for the regression that stands in for it."""
     discount: float = 0.99
+    """What a reward a step later counts for in learning: shaping by a potential is told apart by it."""
     model: str = ""
     data: str = ""
     held_out: bool = False
@@ -164,11 +154,6 @@ def _gold_of(candidate: Any, store: Store[Any]) -> Floats | None:
         if isinstance(error.__cause__, FileNotFoundError):
             return None
         raise
-
-
-def discount_of(learner: Settings) -> float:
-    """The learner's own discount, where it has one."""
-    return float(learner.model_dump().get("discount", Subject.discount))
 
 
 def _segments(judged: Sequence[Judged[Any]]) -> list[Segment]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
 from prefrl.fit import losses
 from prefrl.fit.metrics import Answering
-from prefrl.fit.terms import Choices, Ratings, Terms, Ties
+from prefrl.fit.settings import Reliability, Ties
+from prefrl.fit.terms import Choices, Ratings, Terms
 from prefrl.types import Floats, Metrics
 
-Reliability: TypeAlias = Literal["alike", "learned"]
 START = 0.1
 """The error rate that a labeler is taken to have before anything is learned; below chance, or signs could turn."""
 PRIOR = 1.0

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.special import log_expit, logsumexp
 
+from prefrl.fit.settings import Ties
 from prefrl.types import Floats, Integers
-
-if TYPE_CHECKING:
-    from prefrl.fit.terms import Ties
 
 HOTTEST = 10.0
 CERTAINTY = 0.5

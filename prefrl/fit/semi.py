@@ -10,9 +10,8 @@ from torch import Tensor
 
 from prefrl.components import ConfigError
 from prefrl.fit.losses import choice
+from prefrl.fit.settings import NO_CROP
 from prefrl.types import C
-
-NO_CROP = "fitting.crop: only segments can be cropped; set it to 0 for text"
 
 
 def pairs(candidates: Sequence[C], first: int, count: int, order: torch.Generator) -> Tensor:

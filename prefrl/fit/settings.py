@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
-from prefrl.fit.likelihood import Reliability
-from prefrl.fit.semi import NO_CROP
-from prefrl.fit.terms import Rankings, Ties
+
+Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
+Rankings: TypeAlias = Literal["plackett_luce", "pairs"]
+Reliability: TypeAlias = Literal["alike", "learned"]
+NO_CROP = "fitting.crop: only segments can be cropped; set it to 0 for text"
 
 
 class FittingSettings(Settings):

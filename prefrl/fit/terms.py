@@ -7,20 +7,19 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from prefrl.fit.pairs import implied_pairs
+from prefrl.fit.settings import Rankings, Ties
 from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, person
 from prefrl.types import C
 
-Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
 MOST_TIED = 10
 """Sets of so many candidates are a thousand terms."""
-Rankings: TypeAlias = Literal["plackett_luce", "pairs"]
 
 
 @dataclass(frozen=True, eq=False)

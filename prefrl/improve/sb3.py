@@ -32,6 +32,8 @@ PPO_STEPS = 2048
 """stable-baselines3's default `n_steps`."""
 BATCH = 64
 """The default `batch_size` of its PPO."""
+DISCOUNT = 0.99
+"""The default `gamma` of its algorithms."""
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -67,6 +69,12 @@ class SB3Settings(Settings):
 
     def work(self) -> float:
         return float(self.steps_per_round)
+
+    @property
+    def discount(self) -> float:
+        """stable-baselines3's `gamma`."""
+        options: dict[str, Any] = self.options
+        return float(options.get("gamma", DISCOUNT))
 
     @property
     def at_once(self) -> int:

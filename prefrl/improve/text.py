@@ -104,6 +104,11 @@ class TextLearnerSettings(Settings):
     def work(self) -> float:
         return float(self.updates * self.prompts)
 
+    @property
+    def discount(self) -> float:
+        """A response is scored as a whole: no token counts for less because it comes later."""
+        return 1.0
+
     def build(self, task: Task, rng: np.random.Generator) -> TextLearner:
         return TextLearner(self, text(task, self.kind))
 

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from linear_reward import LinearReward, segment
 
+from prefrl import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.grade import Habits, Subject, grade, habits, judgements
 from prefrl.fit.metrics import accuracy, brier, calibration_error
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
+from prefrl.rundir import Run
+from prefrl.stages import report_card
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment, gold_score
 
@@ -164,3 +167,21 @@ def test_habits_are_those_of_the_newest_fit() -> None:
     assert (before.ties, before.tie) == ("davidson", 0.4)
     assert before.error.tolist() == pytest.approx([0.3, 0.2])  # type: ignore[union-attr]
     assert habits(FittingSettings(), []).error_rates == {}
+
+
+def test_the_cards_of_a_run_discount_as_its_learner_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[float] = []
+
+    def graded(subject: Subject, rng: np.random.Generator) -> ReportCard:
+        seen.append(subject.discount)
+        return grade(subject, rng)
+
+    monkeypatch.setattr("prefrl.rundir.grade", graded)
+    monkeypatch.setattr("prefrl.stages.grade", graded)
+    small = ["loop.rounds=1", "loop.labels=40", "fitting.epochs=1", "fitting.held_out=0.5", "learner.kind=sb3"]
+    config = Config.load("control/toy", [*small, "learner.steps_per_round=320", "learner.options={gamma: 0.9}"])
+    with Run(config, tmp_path / "run") as run:
+        list(run)
+        run.report()
+    report_card(tmp_path / "run")
+    assert seen == [0.9, 0.9]

@@ -6,7 +6,7 @@ import torch
 
 from prefrl.fit.losses import davidson, rao_kupper
 from prefrl.fit.metrics import Answering, accuracy, brier, calibration_error, log_losses, temperature
-from prefrl.fit.terms import Ties
+from prefrl.fit.settings import Ties
 
 
 def test_accuracy_leaves_ties_out_and_gives_half_for_an_even_prediction() -> None:

@@ -10,6 +10,7 @@ from scipy.stats import pearsonr
 from prefrl.components import ConfigError, settings_class
 from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
+from prefrl.fit.split import split
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
 from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
 from prefrl.label.oracle import Oracle, OracleSettings
@@ -460,11 +461,17 @@ def test_the_model_is_calibrated_by_the_temperature_that_is_reported(judged: lis
 
 
 def test_training_metrics_are_of_training_judgements_alone(judged: list[Judged[Segment]]) -> None:
-    metrics = fit_judged(
-        model(1), judged[:40], FittingSettings(epochs=300, held_out=0.3), np.random.default_rng(0)
-    ).metrics
+    settings = FittingSettings(epochs=300, held_out=0.3)
+    out = split(judged[:40], settings.held_out)
+    turned = [reversed_answer(j) if held_out else j for j, held_out in zip(judged, out, strict=False)]
+    metrics = fit_judged(model(1), turned, settings, np.random.default_rng(0)).metrics
     assert metrics["accuracy"] == 1.0
-    assert metrics["accuracy_held_out"] < 1.0
+    assert metrics["accuracy_held_out"] < 0.5
+
+
+def reversed_answer(one: Judged[Segment]) -> Judged[Segment]:
+    assert isinstance(one.judgement, Comparison)
+    return Judged(one.query, Comparison(one.query.id, 1 - one.judgement.preference))
 
 
 def test_judgements_that_contradict_each_other_balance(judged: list[Judged[Segment]]) -> None:

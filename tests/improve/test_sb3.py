@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -17,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.sb3 import SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
+from prefrl.improve.sb3 import ALGORITHMS, SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
 from prefrl.policies.rollout import learned_rewards
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
@@ -41,6 +42,13 @@ def _learner(task: GymnasiumTask, algorithm: dict[str, Any], seed: int = 0, **se
 
 def _bytes(learner: SB3) -> bytes:
     return b"".join(p.detach().numpy().tobytes() for p in learner.model.policy.parameters())
+
+
+def test_the_discount_is_what_stable_baselines3_calls_gamma() -> None:
+    assert SB3Settings(options={"gamma": 0.9}).discount == 0.9
+    for name, algorithm in ALGORITHMS.items():
+        default = signature(algorithm).parameters["gamma"].default
+        assert SB3Settings.model_validate({"algorithm": name}).discount == default
 
 
 @both

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -30,7 +29,7 @@ from prefrl.store import Store
 from prefrl.types import Query, Segment
 
 Come = Callable[[str], httpx.Client]
-SOON = 20.0
+SOON = 40.0
 """Seconds in which everything here must have happened, on a machine that does other things too."""
 
 
@@ -221,15 +220,14 @@ def test_a_run_goes_on_at_another_address_and_with_no_other_setting(tmp_path: Pa
         Run(Config.load("control/toy", (*web, "labeler.enough=0.9")), tmp_path / "run")
 
 
-def test_closing_takes_seconds_even_with_open_connections(
+def test_closing_does_not_wait_for_open_connections(
     come: Come, asked: Store[Segment], opened: tuple[WebLabeler, str]
 ) -> None:
     made, address = opened
     client = come(address)
     client.get("/healthz")
-    begin = time.monotonic()
     made.close()
-    assert time.monotonic() - begin < 5
+    assert not [t for t in threading.enumerate() if t.name.startswith("prefrl-")], "it waits for the connection"
     with pytest.raises(httpx.HTTPError):
         client.get("/healthz")
 

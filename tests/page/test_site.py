@@ -25,7 +25,7 @@ from prefrl.page.service import Service
 from prefrl.store import Store
 from prefrl.types import Query, Segment
 
-SOON = 20.0
+SOON = 40.0
 """Seconds in which everything here must have happened, on a machine that does other things too."""
 LEASE = 0.2
 
@@ -172,14 +172,27 @@ def test_skips_are_no_judgements(wait: Wait, mode: str, skips: int, needed: int)
     assert waiting.ends()
 
 
-def test_an_answer_taken_back_while_goodbye_is_said_is_waited_for_again(wait: Wait, store: Store[Any]) -> None:
+def test_an_answer_taken_back_while_goodbye_is_said_is_waited_for_again(
+    wait: Wait, store: Store[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goodbye, taken_back = threading.Event(), threading.Event()
+
+    def sleep(seconds: float) -> None:
+        if seconds == site.GOODBYE_SECONDS:
+            goodbye.set()
+            taken_back.wait(SOON)
+        else:
+            time.sleep(seconds)
+
     waiting = wait(3)
+    monkeypatch.setattr(site, "time", SimpleNamespace(sleep=sleep, thread_time=time.thread_time))
     me = waiting.come()
     last = answer(me, 9)[-1]
-    while not waiting.service.finished:
-        time.sleep(0.01)
+    assert goodbye.wait(SOON)
+    assert waiting.service.finished
     undo = {"submission_id": secrets.token_hex(16), "assignment_id": last}
     assert me.post("/api/undo", json=undo).status_code == 200
+    taken_back.set()
     assert waiting.goes_on()
     assert ask_for(me)[0]["assignment_id"] == last
     answer(me, 9, "second")

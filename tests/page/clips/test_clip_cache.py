@@ -223,6 +223,6 @@ def test_a_killed_server_leaves_no_process_behind(run: tuple[Path, Query[Segment
         "sys.stdout.write(str(clips._drawer.pid)); sys.stdout.flush(); os.kill(os.getpid(), 9)"
     )
     command = [sys.executable, "-c", code, str(folder), query.candidates[0].id]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == -9, done.stderr
-    until(lambda: not alive(int(done.stdout)), 5)
+    until(lambda: not alive(int(done.stdout)))
