@@ -125,19 +125,38 @@ def step(
     """
     mask = batch.inputs.mask
     rows, steps = len(mask), int(mask.sum())
+    parts = (_losses(policy, some, objective, rows, steps) for some in batch.parts(part))
+    return descend(policy.parameters(), optimizer, parts, objective.max_grad_norm)
+
+
+def descend(
+    parameters: Iterable[torch.nn.Parameter],
+    optimizer: torch.optim.Optimizer,
+    parts: Iterable[tuple[Tensor, dict[str, Tensor]]],
+    max_grad_norm: float,
+) -> Metrics:
+    """One gradient step on a loss that comes in parts, each with what it measured: (loss, name -> number).
+
+    Losses and measures add up over parts; `ratio_error` is the largest. Raises FloatingPointError, before anything
+    changes, where the loss or the gradient is not finite.
+    """
     optimizer.zero_grad()
     measured = []
-    for some in batch.parts(part):
-        loss, seen = _losses(policy, some, objective, rows, steps)
+    for loss, seen in parts:
         loss.backward()  # type: ignore[no-untyped-call]
+        names = ("loss", *seen)
         measured.append(torch.stack([loss.detach(), *seen.values()]))
-    names, found = ("loss", *seen), torch.stack(measured)
+    found = torch.stack(measured)
     metrics = dict(zip(names, found.sum(0).tolist(), strict=True))
     if "ratio_error" in metrics:
-        metrics["ratio_error"] = float(found[:, -1].max())
-    norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), objective.max_grad_norm)
-    metrics["grad_norm"] = float(norm)
-    finite(metrics, "loss", "grad_norm")
+        metrics["ratio_error"] = float(found[:, names.index("ratio_error")].max())
+    metrics["grad_norm"] = float(torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm))
+    for name in ("loss", "grad_norm"):
+        if not math.isfinite(metrics[name]):
+            raise FloatingPointError(
+                f"the {name} of a gradient step is {metrics[name]}; expected a finite number: look at the reward "
+                "model's scores, or lower learner.learning_rate"
+            )
     optimizer.step()
     return metrics
 
@@ -201,13 +220,3 @@ def steer(optimizer: torch.optim.Optimizer, kl: float, target: float, start: flo
     group = optimizer.param_groups[0]
     factor = 1 / 1.5 if kl > 2 * target else 1.5 if kl < target / 2 else 1.0
     group["lr"] = min(max(group["lr"] * factor, 0.01 * start), 10 * start)
-
-
-def finite(metrics: Metrics, *names: str) -> None:
-    """Raise FloatingPointError for the first of these that is not finite."""
-    for name in names:
-        if not math.isfinite(metrics[name]):
-            raise FloatingPointError(
-                f"the {name} of a gradient step is {metrics[name]}; expected a finite number: look at the reward "
-                "model's scores, or lower learner.learning_rate"
-            )

@@ -31,7 +31,7 @@ class Responses:
     mask: Tensor
     """(B, L) bool: the real tokens, the end token included."""
     logp: Tensor
-    """(B, L) float32: log-probabilities at sampling; 0 on padding."""
+    """(B, L) float32: log-probabilities at sampling; 0 on padding, and where nobody sampled them here."""
     ended: Tensor
     """(B,) bool: whether there is an end token."""
 
@@ -59,6 +59,22 @@ class Responses:
         """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
         for at in self.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
             yield at, self.rows(at)
+
+    @classmethod
+    def of(cls, candidates: Sequence[Response], tokenizer: PreTrainedTokenizerBase) -> Responses:
+        """Responses that were sampled as they were; those that came as text alone are encoded, an end token added."""
+        ends, pairs = int(tokenizer.eos_token_id), []
+        for one in candidates:
+            prompt = one.prompt_tokens or tuple(tokenizer.encode(one.prompt))
+            tokens = one.tokens or (*tokenizer.encode(one.text, add_special_tokens=False), ends)
+            pairs.append((prompt, tokens))
+        lengths = torch.tensor([len(tokens) for _, tokens in pairs])
+        mask = torch.arange(int(lengths.max())) < lengths[:, None]
+        padded = torch.zeros(mask.shape, dtype=torch.int64)
+        padded[mask] = torch.tensor([token for _, tokens in pairs for token in tokens])
+        ended = torch.tensor([tokens[-1] == ends for _, tokens in pairs])
+        texts = tuple(one.prompt for one in candidates)
+        return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, torch.zeros(mask.shape), ended)
 
     def candidates(self, tokenizer: PreTrainedTokenizerBase) -> list[Response]:
         """The same as the vocabulary's `Response`s, without gold."""
