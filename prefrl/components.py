@@ -67,6 +67,7 @@ TABLE: dict[Role, dict[str, str]] = {
     },
     "learners": {
         "control": "prefrl.improve.control:ControlLearnerSettings",
+        "dpo": "prefrl.improve.dpo:DPOSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
         "text": "prefrl.improve.text:TextLearnerSettings",
     },

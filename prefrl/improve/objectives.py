@@ -11,6 +11,7 @@ from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 Reduction: TypeAlias = Literal["token", "sequence", "constant"]
 MAX_LOG_RATIO = 20.0
@@ -131,6 +132,16 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip: float 
         return 0.5 * free
     near = old_values + (values - old_values).clamp(-clip, clip)
     return 0.5 * torch.maximum(free, (near - returns) ** 2)
+
+
+def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
+    """(M,) losses of pairs from beta x the difference of their log-ratios to the reference (M,).
+
+    Rafailov et al. 2023, equation 7; `preference` (M,) in [0, 1] is for the first of a pair, and `smoothing` the share
+    of them that are taken to be wrong (cDPO, Mitchell 2023).
+    """
+    right = preference * (1 - smoothing) + (1 - preference) * smoothing
+    return -(right * logsigmoid(margins) + (1 - right) * logsigmoid(-margins))
 
 
 # --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------

@@ -7,7 +7,6 @@ loss, whose gradient is that of the other direction.
 
 from __future__ import annotations
 
-import copy
 from collections import defaultdict
 from dataclasses import replace
 from typing import Any, Literal
@@ -18,10 +17,10 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings, filled_in
-from prefrl.evaluate.policies import responses
-from prefrl.improve.gradient import Batch, Objective, adam, update
+from prefrl.improve.gradient import Batch, Objective, update
 from prefrl.improve.objectives import AdaptiveKL, Reduction, group_normalised, kl_k1, leave_one_out, step_rewards
-from prefrl.policies.language import LanguagePolicy, Responses, text
+from prefrl.improve.writer import Writer
+from prefrl.policies.language import Responses, text
 from prefrl.protocols import RewardModel, Store, Task, TextTask
 from prefrl.seeding import draw_seed
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
@@ -125,21 +124,18 @@ class TextLearner:
 
     def __init__(self, settings: TextLearnerSettings, task: TextTask) -> None:
         self._settings, self._task = settings, task
-        self.policy = LanguagePolicy(task, settings.temperature, settings.chunk)
-        self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
+        self._writer = Writer(task, settings.learning_rate, settings.temperature, settings.chunk)
+        self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
-        self._steps, self._updates = Steps(), 0
+        self._updates = 0
 
     @property
     def steps(self) -> Steps:
-        return self._steps
+        return self._writer.steps
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Response]:
         """Groups of `asked_responses` responses to random prompts."""
-        groups = -(-count // self._settings.asked_responses)
-        drawn = self.policy.respond(self._task.prompts(groups, rng), self._settings.asked_responses, rng)
-        self._steps = self._steps.add(query=drawn.count)
-        return self.policy.with_gold(drawn)
+        return self._writer.ask(count, self._settings.asked_responses, rng)
 
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
         """`updates` batches of fresh responses; the metrics are means over them.
@@ -150,9 +146,7 @@ class TextLearner:
         """
         seen: dict[str, list[float]] = defaultdict(list)
         for _ in range(self._settings.updates):
-            prompts = self._task.prompts(self._settings.prompts, rng)
-            drawn = self.policy.respond(prompts, self._settings.responses, rng)
-            self._steps = self._steps.add(learn=drawn.count)
+            drawn = self._writer.write(self._settings.prompts, self._settings.responses, rng)
             for name, value in self._update(drawn, reward, rng).items():
                 seen[name].append(value)
             self._updates += 1
@@ -160,22 +154,15 @@ class TextLearner:
         return means | {"ratio_error": max(seen["ratio_error"])}
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
-        """One response at temperature 1 to each evaluation prompt; see `prefrl.evaluate.policies.responses`."""
-        evaluated, tokens = responses(self.policy, self._settings.evaluation_prompts, reward, rng)
-        self._steps = self._steps.add(evaluate=tokens)
-        return evaluated
+        return self._writer.evaluate(self._settings.evaluation_prompts, reward, rng)
 
     def state(self) -> State:
-        optimizer = copy.deepcopy(self._optimizer.state_dict())
-        numbers = {"steps": list(self._steps), "updates": self._updates, "beta": self._kl.beta}
-        return {"model": self.policy.state(), "optimizer": optimizer, **numbers}
+        return self._writer.state() | {"updates": self._updates, "beta": self._kl.beta}
 
     def load(self, state: State) -> None:
         """Raises ValueError where names or shapes differ."""
-        self.policy.load(state["model"])
-        self._optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
-        self._steps, self._updates = Steps(*state["steps"]), int(state["updates"])
-        self._kl = replace(self._kl, beta=float(state["beta"]))
+        self._writer.load(state)
+        self._updates, self._kl = int(state["updates"]), replace(self._kl, beta=float(state["beta"]))
 
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
@@ -190,7 +177,12 @@ class TextLearner:
         advantages = advantages_of(groups, settings.advantage).view(-1, 1)
         batch = Batch(drawn, drawn.logp, advantages, reference=reference)
         steps = update(
-            self.policy, self._optimizer, batch, self._minibatches(len(batch), rng), self._objective(), settings.chunk
+            self.policy,
+            self._writer.optimizer,
+            batch,
+            self._minibatches(len(batch), rng),
+            self._objective(),
+            settings.chunk,
         )
         sequence_kl = float(kl.sum(1).mean())
         if settings.kl_target is not None:
