@@ -223,10 +223,11 @@ class TextLearner:
         if self._settings.kl_target is not None:
             self._kl = self._kl.update(sequence_kl, len(batch))
         lengths = batch.mask.sum(1).float()
+        if self._settings.beta:  # what was not measured is absent, not 0
+            learned["kl"] = sequence_kl
         return learned | {
             "reward": float(raw.mean()),
             "reward_std": float(raw.std(correction=0)),
-            "kl": sequence_kl,
             "surprise": -float(batch.logp.sum() / batch.count),
             "length": float(lengths.mean()),
             "ended": float(batch.ended.float().mean()),
@@ -235,7 +236,7 @@ class TextLearner:
         }
 
     def _reference_logp(self, batch: Responses) -> Tensor:
-        """(B, L) under the starting policy; where the KL does not count it is not run, and the KL is 0."""
+        """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
         if self._settings.beta == 0:
             return batch.logp
         return all_logp(self._reference, batch, self._settings.temperature, self._settings.chunk)
