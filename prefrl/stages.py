@@ -237,6 +237,7 @@ def _fits(model: Path) -> list[dict[str, Any]]:
 def _write_rewardbench(subject: Subject, folder: Path) -> None:
     """Every pair in which one response is preferred, with the scores of both."""
     from prefrl.reward_models.io import ScoredPair, write_rewardbench
+    from prefrl.reward_models.text import TransformerReward
 
     pairs, rows = batch(subject.judged), []
     if not all(isinstance(c, Response) for c in pairs.candidates):
@@ -247,8 +248,9 @@ def _write_rewardbench(subject: Subject, folder: Path) -> None:
         chosen, rejected = (pairs.candidates[i].prompt + pairs.candidates[i].text for i in (best, worst))
         if preference != 0.5:
             rows.append(ScoredPair(number, subject.data, chosen, rejected, float(scores[best]), float(scores[worst])))
-    backbone = getattr(subject.reward, "backbone", None)  # a reward model of another make has none
-    write_rewardbench(folder, subject.model, rows, chat=bool(backbone and backbone.chat))
+    reward = subject.reward  # a reward model of another make knows no chat template
+    chat = isinstance(reward, TransformerReward) and reward.backbone.chat
+    write_rewardbench(folder, subject.model, rows, chat)
 
 
 def write_card(card: ReportCard, data: Path | None, page: Path | None) -> None:
