@@ -272,9 +272,9 @@ def estimate(config: Config) -> float:
 
     Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
     """
-    true_size = {name: value for name, value in config.learner if name.startswith("evaluation_")}
-    small = shrink(config).model_copy(update={"task": config.task})
-    small = small.model_copy(update={"learner": small.learner.model_copy(update=true_size)})
+    small = shrink(config)
+    learner = small.learner.with_evaluation_of(config.learner)
+    small = small.model_copy(update={"task": config.task, "learner": learner})
     with tempfile.TemporaryDirectory() as scratch, Store[Any](Path(scratch)) as store:
         loop = small.build(store)
         start, one = (round.metrics for round in loop.run())

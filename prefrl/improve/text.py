@@ -95,6 +95,9 @@ class TextSettings(Settings):
     def shrunk(self) -> TextSettings:
         return self.model_copy(update={"updates": 1, "prompts": min(self.prompts, 4), "evaluation_prompts": 8})
 
+    def with_evaluation_of(self, other: TextSettings) -> TextSettings:
+        return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
+
     def work(self) -> float:
         return float(self.updates * self.prompts)
 
