@@ -38,6 +38,10 @@ class Settings(BaseModel):
         """The same without what may change from one start of a run to the next, such as a port."""
         return self
 
+    def asks_people(self) -> bool:
+        """Whether a labeler speaks to people, and so needs the terminal for itself."""
+        return False
+
     def formula(self) -> str:
         """What a learner optimises, in plain letters; empty where there is nothing to spell out."""
         return ""

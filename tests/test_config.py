@@ -42,6 +42,12 @@ def test_every_kind_of_learner_says_its_discount(name: str, overrides: list[str]
     assert Config.load(name, overrides).discount == discount
 
 
+@pytest.mark.parametrize("kind", TABLE["labelers"])
+def test_no_progress_is_drawn_where_people_are_spoken_to(kind: str) -> None:
+    given = {"annotators": [{"name": "ann"}]} if kind == "crowd" else {}
+    assert settings_class("labelers", kind).model_validate(given).asks_people() == (kind in ("terminal", "web"))
+
+
 @pytest.mark.parametrize("kind", kinds("learners"))
 def test_every_learners_settings_fit_their_role(kind: str) -> None:
     assert isinstance(settings_class("learners", kind)(), LearnerSettings)
