@@ -56,13 +56,13 @@ def described(role: Role, kind: str) -> dict[str, Any]:
     return {**shipped["$defs"][name], "$defs": shipped["$defs"]}
 
 
-def _group(name: str, annotation: type | None, definitions: dict[str, Any]) -> dict[str, Any]:
+def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     """The schema of one top-level key."""
     if name in ROLES:
         role = ROLES[name]
         classes = {settings_class(role, kind): kind for kind in TABLE[role]}  # several kinds may share one
         return {"oneOf": [_define(cls, definitions, kind) for cls, kind in classes.items()]}
-    if annotation is not None and issubclass(annotation, Settings):
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
         return _define(annotation, definitions, None)
     return {"type": "integer"}  # the seed
 
