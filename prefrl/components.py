@@ -30,9 +30,17 @@ class Settings(BaseModel):
         """The same with as little work as still makes sense: for dry runs and tests."""
         return self
 
+    def with_evaluation_of(self, other: Self) -> Self:
+        """The same, evaluated on as much as another learner's settings say; for a learner that can be shrunk."""
+        return self
+
     def lasting(self) -> Self:
         """The same without what may change from one start of a run to the next, such as a port."""
         return self
+
+    def asks_people(self) -> bool:
+        """Whether a labeler speaks to people, and so needs the terminal for itself."""
+        return False
 
     def formula(self) -> str:
         """What a learner optimises, in plain letters; empty where there is nothing to spell out."""

@@ -45,6 +45,12 @@ class Transition(NamedTuple):
     """(n, O): what this step led to, before any reset."""
 
 
+class TaskSettings(Protocol):
+    """What chooses a task."""
+
+    def build(self) -> Task: ...
+
+
 class Environments(Protocol):
     """n environments stepped together. An episode that ends is reset in the same step."""
 
@@ -122,6 +128,12 @@ class Labeler(Protocol[C]):
 
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
         """Answer open queries of the store: all of them now (an oracle), or as far as people have come."""
+
+
+class LabelerSettings(Protocol):
+    """What chooses a labeler."""
+
+    def build(self, task: Any) -> Labeler[Any]: ...
 
 
 @runtime_checkable
@@ -220,6 +232,12 @@ class RewardModel(Protocol[C_contra]):
     def load(self, state: State) -> None: ...
 
 
+class RewardSettings(Protocol):
+    """What chooses a reward model."""
+
+    def build(self, task: Any, rng: np.random.Generator) -> RewardModel[Any]: ...
+
+
 @runtime_checkable
 class StepRewardModel(RewardModel[Segment], Protocol):
     """A reward model for control: a segment's score is the sum of its steps' rewards."""
@@ -270,11 +288,13 @@ class Policy(Protocol[I_contra]):
 
 @runtime_checkable
 class LearnerSettings(Protocol):
-    """A learner's settings, as far as others read them."""
+    """What chooses a learner."""
 
     @property
     def discount(self) -> float:
         """What a reward a step later counts for in learning; 1 where candidates are scored as a whole."""
+
+    def build(self, task: Any, rng: np.random.Generator) -> Learner[Any]: ...
 
 
 class Learner(Protocol[C]):
@@ -305,20 +325,34 @@ class Selector(Protocol[C]):
         """At most `count` queries over candidates of the pool."""
 
 
+class SelectorSettings(Protocol):
+    """What chooses a selector."""
+
+    @property
+    def candidates(self) -> int:
+        """How many there are in a query."""
+
+    def build(self) -> Selector[Any]: ...
+
+
 __all__ = [
     "Attended",
     "ControlTask",
     "Environments",
     "Inputs",
     "Labeler",
+    "LabelerSettings",
     "Learner",
     "LearnerSettings",
     "Policy",
     "RewardModel",
+    "RewardSettings",
     "Selector",
+    "SelectorSettings",
     "StepRewardModel",
     "Store",
     "Task",
+    "TaskSettings",
     "TextTask",
     "Transition",
 ]

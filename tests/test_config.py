@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from prefrl import Config
-from prefrl.components import ConfigError, Settings, kinds, settings_class
+from prefrl.components import TABLE, ConfigError, Settings, kinds, settings_class
 from prefrl.config import presets
 from prefrl.protocols import LearnerSettings
 from prefrl.rundir import Run
@@ -42,9 +42,25 @@ def test_every_kind_of_learner_says_its_discount(name: str, overrides: list[str]
     assert Config.load(name, overrides).discount == discount
 
 
+@pytest.mark.parametrize("kind", TABLE["labelers"])
+def test_no_progress_is_drawn_where_people_are_spoken_to(kind: str) -> None:
+    given = {"annotators": [{"name": "ann"}]} if kind == "crowd" else {}
+    assert settings_class("labelers", kind).model_validate(given).asks_people() == (kind in ("terminal", "web"))
+
+
 @pytest.mark.parametrize("kind", kinds("learners"))
 def test_every_learners_settings_fit_their_role(kind: str) -> None:
     assert isinstance(settings_class("learners", kind)(), LearnerSettings)
+
+
+@pytest.mark.parametrize("kind", TABLE["learners"])
+def test_a_shrunk_learner_can_be_evaluated_at_its_true_size(kind: str) -> None:
+    full = settings_class("learners", kind)()
+    small, true_size = full.shrunk().model_dump(), full.shrunk().with_evaluation_of(full).model_dump()
+    assert small != full.model_dump()
+    evaluation = {name for name in small if name.startswith("evaluation_")}
+    assert {name for name in small if small[name] != true_size[name]} == evaluation
+    assert all(true_size[name] == full.model_dump()[name] for name in evaluation)
 
 
 def test_a_learner_that_does_not_say_its_discount_is_refused_before_it_learns(tmp_path: Path) -> None:

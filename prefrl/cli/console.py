@@ -78,9 +78,8 @@ def drive(running: Run) -> None:
     with running:
         for note in running.notes:
             say(note, "yellow")
-        person = running.config.labeler.model_dump()["kind"] in ("terminal", "web")
         try:
-            with progress(running.loop, quiet=person) as bar, interrupts() as check:
+            with progress(running.loop, running.config.labeler.asks_people()) as bar, interrupts() as check:
                 for round in running:
                     bar.update(bar.task_ids[0], completed=round.number)
                     console.print(round_line(round), soft_wrap=True)

@@ -62,10 +62,12 @@ def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str,
         role = ROLES[name]
         classes = {settings_class(role, kind): kind for kind in TABLE[role]}  # several kinds may share one
         return {"oneOf": [_define(cls, definitions, kind) for cls, kind in classes.items()]}
-    return _define(annotation, definitions, None) if hasattr(annotation, "model_json_schema") else {"type": "integer"}
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
+        return _define(annotation, definitions, None)
+    return {"type": "integer"}  # the seed
 
 
-def _define(cls: Any, definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
+def _define(cls: type[Settings], definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
     """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
     made = schema_of(cls)
     definitions |= made.pop("$defs", {})

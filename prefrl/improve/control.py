@@ -94,6 +94,9 @@ class ControlLearnerSettings(Settings):
         steps = min(self.steps_per_round, self.environments * self.rollout_steps)
         return self.model_copy(update={"steps_per_round": steps, "evaluation_episodes": 1})
 
+    def with_evaluation_of(self, other: ControlLearnerSettings) -> ControlLearnerSettings:
+        return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
+
     def work(self) -> float:
         return float(self.steps_per_round)
 

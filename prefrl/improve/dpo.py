@@ -1,15 +1,14 @@
 """Direct preference optimisation for text: the policy is fitted on the judgements, without the reward model.
 
 Variant: the sigmoid loss (Rafailov et al. 2023, equation 7) on all pairs that the judgements imply, the starting policy
-as the reference. A preference between 0 and 1, and a tie, is a soft target (cDPO, Mitchell 2023), and so is label
-smoothing; the pairs of one ranking share its weight. Log-probabilities are sums over a response's tokens. Left out:
-length normalisation, a supervised term, and refreshing the reference.
+as the reference. Soft preferences, ties and label smoothing are soft targets (cDPO, Mitchell 2023); the pairs of one
+ranking share its weight. Left out: length normalisation, a supervised term, refreshing the reference.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -48,11 +47,13 @@ class DPOSettings(Settings):
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=2)
     """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
-    discount: Literal[1] = 1
-    """A response is judged as a whole: no token counts for less."""
+    discount: ClassVar[float] = 1.0  # a response is judged as a whole
 
     def shrunk(self) -> DPOSettings:
         return self.model_copy(update={"epochs": 1, "evaluation_prompts": 8})
+
+    def with_evaluation_of(self, other: DPOSettings) -> DPOSettings:
+        return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
 
     def build(self, task: Task, rng: np.random.Generator) -> DPO:
         return DPO(self, text(task, self.kind))
@@ -82,8 +83,8 @@ class DPO:
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
         """Passes over all judged pairs; metrics are means over gradient steps.
 
-        loss, grad_norm, pairs (how many), accuracy (the share whose better one gained more on the reference; a tie is
-        half), and margin (by how much, in beta x nats). Raises ValueError where no pair was judged.
+        loss, grad_norm, pairs, accuracy (the share whose better one gained more on the reference; a tie is half), and
+        margin (by how much, beta x nats). Raises ValueError where no pair was judged.
         """
         data, policy = batch(store.judged()), self._writer.policy
         if not len(data):
@@ -107,8 +108,7 @@ class DPO:
             margin = self._settings.beta * (gains[:, 0] - gains[:, 1])
             loss = (dpo_loss(margin, preference, self._settings.label_smoothing) * share).sum()
             signed = (margin * (2 * preference - 1).sign()).detach()
-            right = 0.5 * (signed.sign() + 1)
-            yield loss, {"accuracy": (share * right).sum(), "margin": (share * signed).sum()}
+            yield loss, {"accuracy": (share * (signed.sign() + 1) / 2).sum(), "margin": (share * signed).sum()}
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
         return self._writer.evaluate(self._settings.evaluation_prompts, reward, rng)

@@ -67,6 +67,9 @@ class SB3Settings(Settings):
         steps = each * self.environments
         return self.model_copy(update={"options": options, "steps_per_round": steps, "evaluation_episodes": 1})
 
+    def with_evaluation_of(self, other: SB3Settings) -> SB3Settings:
+        return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
+
     def work(self) -> float:
         return float(self.steps_per_round)
 

@@ -100,6 +100,9 @@ class TextLearnerSettings(Settings):
     def shrunk(self) -> TextLearnerSettings:
         return self.model_copy(update={"updates": 1, "prompts": min(self.prompts, 4), "evaluation_prompts": 8})
 
+    def with_evaluation_of(self, other: TextLearnerSettings) -> TextLearnerSettings:
+        return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
+
     def work(self) -> float:
         return float(self.updates * self.prompts)
 
@@ -176,27 +179,20 @@ class TextLearner:
         groups = returns.view(-1, settings.responses)
         advantages = advantages_of(groups, settings.advantage).view(-1, 1)
         batch = Batch(drawn, drawn.logp, advantages, reference=reference)
-        steps = update(
-            self.policy,
-            self._writer.optimizer,
-            batch,
-            self._minibatches(len(batch), rng),
-            self._objective(),
-            settings.chunk,
-        )
+        minibatches, objective = self._minibatches(len(batch), rng), self._objective()
+        steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.chunk)
         sequence_kl = float(kl.sum(1).mean())
         if settings.kl_target is not None:
             self._kl = self._kl.update(sequence_kl, len(batch))
-        lengths = drawn.mask.sum(1).float()
         return (
             steps[-1]
-            | {"ratio_error": steps[0]["ratio_error"]}
             | {
+                "ratio_error": steps[0]["ratio_error"],
                 "reward": float(raw.mean()),
                 "reward_std": float(raw.std(correction=0)),
-                "kl": sequence_kl,
+                **({"kl": sequence_kl} if settings.beta else {}),  # what was not measured is absent, not 0
                 "surprise": -float(drawn.logp.sum() / drawn.count),
-                "length": float(lengths.mean()),
+                "length": float(drawn.mask.sum(1).float().mean()),
                 "ended": float(drawn.ended.float().mean()),
                 "beta": self._kl.beta,
                 "equal_groups": float((groups == groups[:, :1]).all(1).float().mean()),
@@ -212,7 +208,7 @@ class TextLearner:
         )
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
-        """(B, L) under the starting policy; where the KL does not count it is not run, and the KL is 0."""
+        """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
         return drawn.logp if self._settings.beta == 0 else self.policy.start_logp(drawn)
 
     def _minibatches(self, size: int, rng: np.random.Generator) -> list[Tensor]:

@@ -34,6 +34,9 @@ class TerminalSettings(Settings):
     clips: Path = Path("clips")
     """Where the clips of control queries are written."""
 
+    def asks_people(self) -> bool:
+        return True
+
     def build(self, task: Task) -> Terminal:
         return Terminal(self, task)
 

@@ -125,6 +125,9 @@ class WebSettings(Settings):
         place = ("host", "port", "allowed_hosts", "tls_cert", "tls_key")
         return self.model_copy(update={name: type(self).model_fields[name].default for name in place})
 
+    def asks_people(self) -> bool:
+        return True
+
     def build(self, task: Task) -> WebLabeler:
         return WebLabeler(self, task)
 

@@ -110,19 +110,24 @@ class EventLog:
         self._turn = threading.RLock()
         self._head = (0, "")
         self._owner = engines.own(folder) if write else None
+        self._opened: list[sql.Engine] = []
         try:
-            self._writer = engines.writer(folder, url) if write else None
-            self._reader = engines.reader(folder, url)
+            self._writer = self._open(engines.writer(folder, url)) if write else None
+            self._reader = self._open(engines.reader(folder, url))
             self._prepare()
         except BaseException:
             self.close()
             raise
 
+    def _open(self, engine: sql.Engine) -> sql.Engine:
+        """Keep in mind what has to be closed, also where the next step fails."""
+        self._opened.append(engine)
+        return engine
+
     def close(self) -> None:
         """Let go of the database, and of the right to write."""
-        for engine in (getattr(self, "_reader", None), getattr(self, "_writer", None)):
-            if engine is not None:
-                engine.dispose()
+        for engine in reversed(self._opened):  # the writer last: it empties the write-ahead log
+            engine.dispose()
         if self._owner is not None:
             engines.disown(self.folder, self._owner)
             self._owner = None

@@ -96,6 +96,14 @@ def test_the_same_seed_gives_the_same_bytes_and_a_resumed_learner_goes_on_alike(
     assert whole.state()["beta"] == second.state()["beta"]
 
 
+@pytest.mark.parametrize("beta", [0.0, 0.3])
+def test_a_kl_that_was_not_measured_is_absent(toy_reviews: Reviews, beta: float) -> None:
+    one = learner(toy_reviews, updates=2, learning_rate=5e-3, beta=beta)
+    metrics = one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    assert ("kl" in metrics) == (beta > 0)
+    assert metrics.get("kl") != 0.0
+
+
 def test_gold_is_neither_read_nor_attached_while_learning(toy_reviews: Reviews) -> None:
     blind = _WithoutGold(toy_reviews)
     seeing, unseeing = learner(toy_reviews), TextLearnerSettings(**SMALL).build(blind, np.random.default_rng(0))

@@ -24,7 +24,7 @@ import yaml
 
 from prefrl.components import settings_class
 from prefrl.page.clips.encode import NAME, encode
-from prefrl.protocols import ControlTask
+from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.files import write_file
 from prefrl.store import Store
 from prefrl.types import Segment
@@ -68,8 +68,7 @@ class Artist:
         if not path.is_file():
             raise JobError(f"{self.folder} holds no run: expected a file config.yaml in it")
         chosen = yaml.safe_load(path.read_text(encoding="utf-8"))["task"]
-        settings: Any = settings_class("tasks", chosen["kind"]).model_validate(chosen)
-        task = settings.build()
+        task = cast(TaskSettings, settings_class("tasks", chosen["kind"]).model_validate(chosen)).build()
         if task.kind != "control":
             raise JobError(f"the task {task.name} is of kind {task.kind!r}, and has no clips")
         return cast(ControlTask, task)
