@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import perf_counter
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -134,12 +135,23 @@ def clone(settings: CloningSettings, write: Writer) -> tuple[LlamaForCausalLM, P
         model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True
     )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, len(batches)))
-    with progress(len(batches), Console(stderr=True)) as report:
+    with progress(len(batches), Console(stderr=True)) as report, _one_thread():
         for batch in batches:
             report.advance(_step(model, optimizer, batch))
             schedule.step()
     model.eval()  # type: ignore[no-untyped-call]
     return model, tokenizer
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For models this small several threads only wait for one another."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def make_tokenizer(texts: list[str], vocabulary: int) -> PreTrainedTokenizerFast:
@@ -214,11 +226,20 @@ class _Report(Protocol):
     def advance(self, loss: float) -> None: ...
 
 
-class _Line:
-    """Nothing to draw on."""
+class _Lines:
+    """Ten lines in all, where there is nothing to draw on."""
+
+    def __init__(self, console: Console, steps: int) -> None:
+        self._console, self._steps, self._done, self._begin = console, steps, 0, perf_counter()
 
     def advance(self, loss: float) -> None:
-        pass
+        self._done += 1
+        tenths = 10 * self._done // self._steps
+        if tenths > 10 * (self._done - 1) // self._steps:
+            speed = self._done / max(perf_counter() - self._begin, 1e-9)
+            left = (self._steps - self._done) / speed
+            note = f"{self._done} of {self._steps} steps, {speed:.1f} steps/s, loss {loss:.2f}, {left:.0f} s left"
+            self._console.print(f"cloning the grammar: {note}", soft_wrap=True)
 
 
 class _Bar:
@@ -233,10 +254,10 @@ class _Bar:
 
 @contextmanager
 def progress(steps: int, console: Console) -> Iterator[_Report]:
-    """A bar on a terminal, one line elsewhere."""
+    """A bar on a terminal, lines elsewhere."""
     if not console.is_terminal:
         console.print(f"cloning the grammar into a starting policy, {steps} steps (once; it is kept)", soft_wrap=True)
-        yield _Line()
+        yield _Lines(console, steps)
         return
     columns = (
         TextColumn("{task.description}"),

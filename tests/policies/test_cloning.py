@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 from pathlib import Path
 from typing import cast
 
@@ -38,17 +39,18 @@ def test_a_model_is_cloned_once_and_then_read(tmp_path: Path, capfd: pytest.Capt
     assert {name.rsplit(".", 1)[-1] for name in before} == {"json", "safetensors"}
 
 
-def test_progress_is_a_bar_with_a_rate_on_a_terminal_and_one_line_elsewhere() -> None:
+def test_progress_is_a_bar_on_a_terminal_and_ten_lines_elsewhere_each_with_a_rate() -> None:
     shown = {}
     for terminal in (True, False):
         console = Console(file=io.StringIO(), force_terminal=terminal, width=120)
-        with progress(3, console) as report:
-            for _ in range(3):
+        with progress(30, console) as report:
+            for _ in range(30):
                 report.advance(1.5)
         shown[terminal] = cast("io.StringIO", console.file).getvalue()
-    assert "3/3" in shown[True]
+    assert "30/30" in shown[True]
     assert "steps/s, loss 1.50" in shown[True]
-    assert shown[False].count("\n") == 1
+    assert shown[False].count("\n") == 11
+    assert re.search(r"30 of 30 steps, [\d.]+ steps/s, loss 1.50, 0 s left", shown[False])
 
 
 def test_cloning_twice_gives_the_same_bytes(tmp_path: Path) -> None:
