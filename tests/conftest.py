@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import postgres_server
 import pytest
+import runs
 import torch
 
+from prefrl.config import Config
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
@@ -19,6 +22,9 @@ if TYPE_CHECKING:
     from shell import Shell
 
     from prefrl.envs.text import Reviews
+
+
+pytest_plugins = ["budget"]
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -31,7 +37,7 @@ def _one_thread() -> None:
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests, and the processes they start, keep starting policies in a folder of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(runs.made_once(tmp_path_factory, "cache", Path.mkdir)))
         yield
 
 
@@ -96,12 +102,34 @@ def postgres_url(postgres: str) -> str:
 
 
 @pytest.fixture(scope="session")
+def finished_toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of "control/toy". All tests share it: nobody may write there."""
+    return runs.made_once(tmp_path_factory, "toy", lambda folder: runs.finish(Config.load("control/toy"), folder))
+
+
+@pytest.fixture
+def toy_run(finished_toy: Path, tmp_path: Path) -> Path:
+    """A finished run of "control/toy" that a test may do with as it likes, in the folder `run`."""
+    return runs.copied(finished_toy, tmp_path / "run")
+
+
+@pytest.fixture(scope="session")
+def finished_tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The finished tiny run of each toy preset. All tests share them: nobody may write there."""
+    made = {}
+    for number, name in enumerate(runs.TINY):
+        config = runs.tiny(name)
+        made[name] = runs.made_once(tmp_path_factory, f"tiny-{number}", partial(runs.finish, config))
+    return made
+
+
+@pytest.fixture(scope="session")
 def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
     """The text task with a tiny starting policy, cloned once for all tests."""
     from prefrl.envs.cloning import CloningSettings
     from prefrl.envs.text import ReviewsSettings
 
-    cache = tmp_path_factory.mktemp("models")
+    cache = runs.made_once(tmp_path_factory, "models", Path.mkdir)
     cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
     return ReviewsSettings(response_tokens=24, cloning=cloning).build()
 
