@@ -16,6 +16,7 @@ import resource
 import statistics
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,11 +91,19 @@ class Meter:
         self._shared = Cost()
         """Of shared fixtures since the test began."""
 
-    def install(self) -> None:
-        """Count flushes from now on."""
-        for name in ("fsync", "fdatasync"):
-            setattr(os, name, self._counting(getattr(os, name)))
+    @contextmanager
+    def counting(self) -> Iterator[None]:
+        """Count flushes meanwhile."""
+        real = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
+        for name, flush in real.items():
+            setattr(os, name, self._counting(flush))
         sql.event.listen(sql.Engine, "commit", self._committed)
+        try:
+            yield
+        finally:
+            sql.event.remove(sql.Engine, "commit", self._committed)
+            for name, flush in real.items():
+                setattr(os, name, flush)
 
     def now(self) -> Cost:
         used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -110,8 +119,8 @@ class Meter:
     def _committed(self, connection: sql.Connection) -> None:
         if connection.dialect.name == "sqlite":
             database: Any = connection.connection.dbapi_connection
-            self._flushes += database.total_changes != connection.info.get("changes", 0)
-            connection.info["changes"] = database.total_changes
+            self._flushes += database.total_changes != connection.info.get(self, 0)
+            connection.info[self] = database.total_changes
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_setup(self) -> Iterator[None]:
@@ -206,7 +215,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     meter = Meter()
-    meter.install()
+    stack = ExitStack()
+    stack.enter_context(meter.counting())
+    config.add_cleanup(stack.close)
     config.pluginmanager.register(meter, "budget-meter")
     if "PYTEST_XDIST_WORKER" not in os.environ:
         config.pluginmanager.register(Tally(config.getoption("--budget"), config.getoption("--costs")), "budget-tally")

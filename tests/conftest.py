@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
     from prefrl.envs.text import Reviews
 
 
-pytest_plugins = ["budget"]
+pytest_plugins = ["budget", "pytester"]
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -67,6 +70,18 @@ def make_query(make_segment: Callable[..., Segment]) -> Callable[..., Query[Segm
 
 
 @pytest.fixture
+def make_pairs(make_segment: Callable[..., Segment]) -> Callable[[int], list[Query[Segment]]]:
+    """Many pairs out of few segments, which a store files in no time; one is of gold 0, the other of gold 1."""
+
+    def make(count: int) -> list[Query[Segment]]:
+        few = range(math.isqrt(count - 1) + 1)
+        worse, better = ([make_segment(gold=gold) for _ in few] for gold in (0.0, 1.0))
+        return [Query(pair) for pair in product(worse, better)][:count]
+
+    return make
+
+
+@pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store[Segment]]:
     with Store[Segment](tmp_path / "store") as opened:
         yield opened
@@ -89,9 +104,13 @@ def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 
 
 @pytest.fixture(scope="session")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def postgres() -> Iterator[str]:
     """The URL of a PostgreSQL server of our own; without one the test is skipped."""
-    with postgres_server.running(tmp_path_factory.mktemp("postgres")) as url:
+    # Not below pytest's folders: they are closed to others, and root starts the server as somebody else.
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        postgres_server.running(Path(folder)) as url,
+    ):
         yield url
 
 
