@@ -1,9 +1,19 @@
 # Two commands: `make demo` and `make test`. Both make .venv first; both are fast the second time.
+#
+# `make test` is what CI runs. Beside it: `make unit` (the default tests alone), `make budget` (do they take no longer
+# than they may? on an idle machine), `make cover`, and `make nightly` (more kills, stories and examples than CI does).
 PYTHON ?= python3
 BIN := .venv/bin
+PYTEST = .ci/in_memory $(BIN)/python -m pytest -n auto --dist worksteal --hypothesis-seed=$(SEED)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint types layers unit slow browser docs peers clean
+# What hypothesis makes up depends on this alone: `make unit SEED=...` makes the same again.
+ifndef SEED
+SEED := $(shell od -An -N4 -tu4 /dev/urandom | tr -d ' ')
+endif
+export SEED
+
+.PHONY: demo test reading running lint types layers unit slow browser docs cover budget nightly peers clean
 
 demo: .venv/demo
 	$(BIN)/prefrl run control/pendulum --out runs/pendulum
@@ -13,7 +23,21 @@ demo: .venv/demo
 	@echo "  runs/pendulum/report.html"
 	@echo "  runs/reviews/report.html"
 
-test: lint types layers unit slow browser docs
+# Two groups side by side, each in its order; what a step says comes at once when it is over.
+test: .venv/dev
+	@echo "everything is made up from SEED=$(SEED)"
+	+$(MAKE) --no-print-directory --output-sync=target -j2 reading running
+
+reading: .venv/dev
+	$(MAKE) --no-print-directory lint
+	$(MAKE) --no-print-directory layers
+	$(MAKE) --no-print-directory docs
+	$(MAKE) --no-print-directory types
+
+running: .venv/dev
+	$(MAKE) --no-print-directory unit
+	$(MAKE) --no-print-directory slow
+	$(MAKE) --no-print-directory browser
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -26,13 +50,22 @@ layers: .venv/dev
 	$(BIN)/lint-imports
 
 unit: .venv/dev
-	$(BIN)/python -m pytest --cov --cov-report=term
+	$(PYTEST)
 
 slow: .venv/dev
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 browser: .venv/dev
-	$(BIN)/python -m pytest -m browser
+	$(PYTEST) -m browser
+
+nightly: .venv/dev
+	$(PYTEST) -m nightly
+
+cover: .venv/dev
+	$(PYTEST) --cov --cov-report=term
+
+budget: .venv/dev
+	$(PYTEST) --budget
 
 docs: .venv/dev
 	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html

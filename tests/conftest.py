@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import signal
+import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import postgres_server
 import pytest
+import runs
 import torch
 
+from prefrl.config import Config
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
@@ -19,6 +25,9 @@ if TYPE_CHECKING:
     from shell import Shell
 
     from prefrl.envs.text import Reviews
+
+
+pytest_plugins = ["budget", "pytester"]
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -31,7 +40,7 @@ def _one_thread() -> None:
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests, and the processes they start, keep starting policies in a folder of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(runs.made_once(tmp_path_factory, "cache", Path.mkdir)))
         yield
 
 
@@ -61,6 +70,18 @@ def make_query(make_segment: Callable[..., Segment]) -> Callable[..., Query[Segm
 
 
 @pytest.fixture
+def make_pairs(make_segment: Callable[..., Segment]) -> Callable[[int], list[Query[Segment]]]:
+    """Many pairs out of few segments, which a store files in no time; one is of gold 0, the other of gold 1."""
+
+    def make(count: int) -> list[Query[Segment]]:
+        few = range(math.isqrt(count - 1) + 1)
+        worse, better = ([make_segment(gold=gold) for _ in few] for gold in (0.0, 1.0))
+        return [Query(pair) for pair in product(worse, better)][:count]
+
+    return make
+
+
+@pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store[Segment]]:
     with Store[Segment](tmp_path / "store") as opened:
         yield opened
@@ -83,9 +104,13 @@ def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 
 
 @pytest.fixture(scope="session")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def postgres() -> Iterator[str]:
     """The URL of a PostgreSQL server of our own; without one the test is skipped."""
-    with postgres_server.running(tmp_path_factory.mktemp("postgres")) as url:
+    # Not below pytest's folders: they are closed to others, and root starts the server as somebody else.
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        postgres_server.running(Path(folder)) as url,
+    ):
         yield url
 
 
@@ -96,12 +121,34 @@ def postgres_url(postgres: str) -> str:
 
 
 @pytest.fixture(scope="session")
+def finished_toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of "control/toy". All tests share it: nobody may write there."""
+    return runs.made_once(tmp_path_factory, "toy", lambda folder: runs.finish(Config.load("control/toy"), folder))
+
+
+@pytest.fixture
+def toy_run(finished_toy: Path, tmp_path: Path) -> Path:
+    """A finished run of "control/toy" that a test may do with as it likes, in the folder `run`."""
+    return runs.copied(finished_toy, tmp_path / "run")
+
+
+@pytest.fixture(scope="session")
+def finished_tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The finished tiny run of each toy preset. All tests share them: nobody may write there."""
+    made = {}
+    for number, name in enumerate(runs.TINY):
+        config = runs.tiny(name)
+        made[name] = runs.made_once(tmp_path_factory, f"tiny-{number}", partial(runs.finish, config))
+    return made
+
+
+@pytest.fixture(scope="session")
 def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
     """The text task with a tiny starting policy, cloned once for all tests."""
     from prefrl.envs.text import ReviewsSettings
     from prefrl.policies.cloning import CloningSettings
 
-    cache = tmp_path_factory.mktemp("models")
+    cache = runs.made_once(tmp_path_factory, "models", Path.mkdir)
     cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
     return ReviewsSettings(response_tokens=24, cloning=cloning).build()
 

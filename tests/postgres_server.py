@@ -25,15 +25,14 @@ def program(name: str) -> str | None:
 
 @contextmanager
 def running(folder: Path) -> Iterator[str]:
-    """The URL of a server whose data lie in a folder; the test is skipped where none is installed."""
+    """The URL of a server whose data lie in an empty folder; the test is skipped where none is installed."""
     pytest.importorskip("psycopg")
     initdb, postgres = program("initdb"), program("postgres")
     if initdb is None or postgres is None:
         pytest.skip("no PostgreSQL server is installed: apt-get install -y postgresql")
     user = "nobody" if os.getuid() == 0 else None  # it refuses to run as root
     if user:
-        for path in (folder, *folder.parents[:2]):
-            path.chmod(0o755)
+        folder.chmod(0o755)
         shutil.chown(folder, user)
     data = folder / "data"
     init = [initdb, "-D", str(data), "-U", "prefrl", "-A", "trust", "--no-sync", "-E", "UTF8", "--locale=C"]

@@ -9,8 +9,7 @@ from prefrl import Config
 from prefrl.store import Store
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_pendulum_swings_up_from_few_labels(tmp_path: Path, seed: int) -> None:
     """Returns swing with the seed: the mean over five is at least -200 (docs/results.md), a single one may miss it."""
     with Store[Any](tmp_path) as store:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from runs import copied, made_once
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -24,11 +25,20 @@ def blocks(path: Path) -> list[tuple[str, str]]:
 
 
 @pytest.fixture(scope="session")
-def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("workshop")
-    for preset, name in (("control/toy", "pendulum"), ("text/toy", "reviews")):
-        run(f"prefrl run {preset} --out runs/{name}", folder)
-    return folder
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's runs, made once for all."""
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        for preset, name in (("control/toy", "pendulum"), ("text/toy", "reviews")):
+            run(f"prefrl run {preset} --out runs/{name}", folder)
+
+    return made_once(tmp_path_factory, "demo", make)
+
+
+@pytest.fixture
+def workshop(demo: Path, tmp_path: Path) -> Path:
+    return copied(demo, tmp_path / "workshop")
 
 
 def environment() -> dict[str, str]:
@@ -84,9 +94,9 @@ def test_every_block_runs(path: Path, workshop: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
-def test_every_logged_number_is_explained(workshop: Path) -> None:
+def test_every_logged_number_is_explained(demo: Path) -> None:
     explained = (ROOT / "docs/metrics.md").read_text()
-    for path in workshop.glob("runs/*/metrics.jsonl"):
+    for path in demo.glob("runs/*/metrics.jsonl"):
         for key in {key for line in path.read_text().splitlines() for key in json.loads(line)}:
             assert f"`{key.removesuffix('_held_out')}`" in explained, f"{key} is missing in docs/metrics.md"
 

@@ -1,14 +1,11 @@
 import json
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+from runs import copied, exit_code, finish, tiny
 
 from prefrl import Config
 from prefrl.components import ConfigError
@@ -22,12 +19,6 @@ SUMMARY = {
     "task", "kind", "seed", "rounds", "gold_before", "gold_after", "gold_best", "labels", "steps", "reward_accuracy",
     "kl", "fluency_before", "fluency_after", "seconds", "versions",
 }  # fmt: skip
-
-
-def finish(name: str, folder: Path, *overrides: str) -> None:
-    with Run(Config.load(name, overrides), folder) as run:
-        for _ in run:
-            pass
 
 
 def weights(folder: Path) -> dict[str, bytes]:
@@ -44,7 +35,7 @@ def numbers(folder: Path) -> list[dict[str, float]]:
 
 @pytest.mark.parametrize("name", TOYS)
 def test_a_run_leaves_the_files_that_the_design_names(name: str, tmp_path: Path) -> None:
-    folder, config = tmp_path / "run", Config.load(name)
+    folder, config = tmp_path / "run", tiny(name)
     with Run(config, folder) as run:
         assert [r.number for r in run] == list(range(config.loop.rounds + 1))
         run.report()
@@ -63,17 +54,18 @@ def test_a_run_leaves_the_files_that_the_design_names(name: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", TOYS)
-def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(name: str, tmp_path: Path) -> None:
-    finish(name, tmp_path / "whole")
-    with Run(Config.load(name), tmp_path / "parts") as run:
+def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(
+    name: str, finished_tiny: dict[str, Path], tmp_path: Path
+) -> None:
+    with Run(tiny(name), tmp_path / "parts") as run:
         rounds = iter(run)
         next(rounds), next(rounds)
     with Run.resume(tmp_path / "parts") as run:
         assert run.notes == ["going on after round 1"]
         assert [r.number for r in run] == list(range(2, run.config.loop.rounds + 1))
-    assert weights(tmp_path / "parts") == weights(tmp_path / "whole")
-    assert numbers(tmp_path / "parts") == numbers(tmp_path / "whole")
-    assert (tmp_path / "parts/probes.jsonl").read_bytes() == (tmp_path / "whole/probes.jsonl").read_bytes()
+    assert weights(tmp_path / "parts") == weights(finished_tiny[name])
+    assert numbers(tmp_path / "parts") == numbers(finished_tiny[name])
+    assert (tmp_path / "parts/probes.jsonl").read_bytes() == (finished_tiny[name] / "probes.jsonl").read_bytes()
 
 
 DYING = """
@@ -108,17 +100,9 @@ with Run(Config.load(name), folder) as run:
 """
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A run that nobody disturbed."""
-
-    @cache
-    def make(name: str) -> Path:
-        folder = tmp_path_factory.mktemp("whole") / "run"
-        finish(name, folder)
-        return folder
-
-    return make
+def write_down(config: Config, folder: Path) -> str:
+    (folder / "config.yaml").write_text(config.dump())
+    return str(folder / "config.yaml")
 
 
 @pytest.mark.parametrize(
@@ -134,52 +118,48 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     ],
 )
 def test_a_run_killed_at_any_moment_ends_in_the_same_bytes(
-    name: str, moment: str, whole: Callable[[str], Path], tmp_path: Path
+    name: str, moment: str, finished_tiny: dict[str, Path], tmp_path: Path
 ) -> None:
-    child = subprocess.run([sys.executable, "-c", DYING, name, str(tmp_path / "killed"), moment], check=False)
-    assert child.returncode == -signal.SIGKILL
-    finish(name, tmp_path / "killed")
-    assert weights(tmp_path / "killed") == weights(whole(name))
-    assert numbers(tmp_path / "killed") == numbers(whole(name))
-    assert (tmp_path / "killed/probes.jsonl").read_bytes() == (whole(name) / "probes.jsonl").read_bytes()
-    with Store[Any](tmp_path / "killed", write=False) as a, Store[Any](whole(name), write=False) as b:
+    config = write_down(tiny(name), tmp_path)
+    assert exit_code(DYING, config, str(tmp_path / "killed"), moment) == -signal.SIGKILL
+    finish(tiny(name), tmp_path / "killed")
+    assert weights(tmp_path / "killed") == weights(finished_tiny[name])
+    assert numbers(tmp_path / "killed") == numbers(finished_tiny[name])
+    assert (tmp_path / "killed/probes.jsonl").read_bytes() == (finished_tiny[name] / "probes.jsonl").read_bytes()
+    with Store[Any](tmp_path / "killed", write=False) as a, Store[Any](finished_tiny[name], write=False) as b:
         assert a.answers() == b.answers()
 
 
-def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    finish("control/toy", tmp_path / "whole")
+def test_a_damaged_checkpoint_is_passed_over_and_named(finished_tiny: dict[str, Path], tmp_path: Path) -> None:
+    copied(finished_tiny["control/toy"], tmp_path / "run")
     broken = max((tmp_path / "run/checkpoints").iterdir()) / "learner.safetensors"
     broken.write_bytes(broken.read_bytes()[:-1])
     with Run.resume(tmp_path / "run") as run:
         assert "learner.safetensors" in run.notes[0]
         assert run.notes[1] == f"going on after round {run.config.loop.rounds - 1}"
         list(run)
-    assert weights(tmp_path / "run") == weights(tmp_path / "whole")
+    assert weights(tmp_path / "run") == weights(finished_tiny["control/toy"])
 
 
-def test_no_good_checkpoint_is_an_error_that_says_why(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    for manifest in (tmp_path / "run/checkpoints").rglob("MANIFEST.json"):
+def test_no_good_checkpoint_is_an_error_that_says_why(toy_run: Path) -> None:
+    for manifest in (toy_run / "checkpoints").rglob("MANIFEST.json"):
         manifest.unlink()
     with pytest.raises(RunError, match="no checkpoint that can be used"):
-        Run.resume(tmp_path / "run")
-    with Store(tmp_path / "run"):
+        Run.resume(toy_run)
+    with Store(toy_run):
         """The failed attempt let go of the store."""
 
 
-def test_a_finished_run_is_left_as_it_is(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    before = weights(tmp_path / "run")
-    finish("control/toy", tmp_path / "run")
-    assert weights(tmp_path / "run") == before
-    assert len(numbers(tmp_path / "run")) == Config.load("control/toy").loop.rounds + 1
+def test_a_finished_run_is_left_as_it_is(toy_run: Path) -> None:
+    before = weights(toy_run)
+    finish(Config.load("control/toy"), toy_run)
+    assert weights(toy_run) == before
+    assert len(numbers(toy_run)) == Config.load("control/toy").loop.rounds + 1
 
 
-def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
+def test_a_folder_with_another_run_or_other_things_is_refused(toy_run: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"fitting\.epochs is 60 there, 6 here"):
-        Run(Config.load("control/toy", ["fitting.epochs=6"]), tmp_path / "run")
+        Run(Config.load("control/toy", ["fitting.epochs=6"]), toy_run)
     (tmp_path / "things").mkdir()
     (tmp_path / "things/letter.txt").write_text("dear")
     with pytest.raises(RunError, match="not empty"):
@@ -188,9 +168,8 @@ def test_a_folder_with_another_run_or_other_things_is_refused(tmp_path: Path) ->
         Run.resume(tmp_path / "nothing")
 
 
-def test_a_checkpoint_holds_all_that_is_needed_to_use_it(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    shutil.copytree(max((tmp_path / "run/checkpoints").iterdir()), tmp_path / "alone")
+def test_a_checkpoint_holds_all_that_is_needed_to_use_it(toy_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(max((toy_run / "checkpoints").iterdir()), tmp_path / "alone")
     saved = open_saved(tmp_path / "alone")
     assert saved.config == Config.load("control/toy")
     assert load_state(saved.folder, "learner")["steps"][0] > 0
@@ -199,46 +178,45 @@ def test_a_checkpoint_holds_all_that_is_needed_to_use_it(tmp_path: Path) -> None
 def test_a_start_that_failed_does_not_block_the_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigError):
         Run(Config.load("control/toy", ["task.segment_steps=41"]), tmp_path / "run")
-    with Run(Config.load("control/toy"), tmp_path / "run") as run:
+    with Run(tiny("control/toy"), tmp_path / "run") as run:
         next(iter(run))
 
 
-def test_labels_are_not_added_to_the_folder_of_a_run(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    before = (tmp_path / "run/config.yaml").read_bytes()
+def test_labels_are_not_added_to_the_folder_of_a_run(toy_run: Path) -> None:
+    before = (toy_run / "config.yaml").read_bytes()
     with pytest.raises(RunError, match="asks for its own labels"):
-        label(Config.load("control/toy", ["loop.labels=7"]), tmp_path / "run")
-    assert (tmp_path / "run/config.yaml").read_bytes() == before
+        label(Config.load("control/toy", ["loop.labels=7"]), toy_run)
+    assert (toy_run / "config.yaml").read_bytes() == before
 
 
-def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "a")
-    finish("control/toy", tmp_path / "b", "seed=1")
-    config = with_reward(Config.load("control/toy", ["loop.rounds=1"]), tmp_path / "a")
-    Run(config, tmp_path / "policy", tmp_path / "a").close()  # stopped before anything was done
+def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(
+    finished_tiny: dict[str, Path], tmp_path: Path
+) -> None:
+    config, first = tiny("control/toy", "loop.rounds=1"), finished_tiny["control/toy"]
+    finish(tiny("control/toy", "loop.rounds=1", "seed=1"), tmp_path / "second")
+    config = with_reward(config, first)
+    Run(config, tmp_path / "policy", first).close()  # stopped before anything was done
     with Run.resume(tmp_path / "policy") as run:
         assert run.loop.reward.fitted
         *_, last = run
     assert last.metrics["steps/learn"] > 0
     with pytest.raises(RunError, match="another reward model"):
-        Run(config, tmp_path / "policy", tmp_path / "b")
-    other = with_reward(Config.load("control/toy", ["task.horizon=30"]), tmp_path / "a")
+        Run(config, tmp_path / "policy", tmp_path / "second")
+    other = with_reward(tiny("control/toy", "task.horizon=30"), first)
     with pytest.raises(RunError, match=r"another task \(task\.horizon is 40 there, 30 here\)"):
-        Run(other, tmp_path / "other", tmp_path / "a")
+        Run(other, tmp_path / "other", first)
 
 
 @pytest.mark.parametrize("name", ["what?", "100%", "a#b", "ü n", "[red]x"])
 def test_a_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
-    with Run(Config.load("control/toy", ["loop.rounds=1"]), tmp_path / name) as run:
-        list(run)
+    finish(tiny("control/toy", "loop.rounds=1"), tmp_path / name)
     assert [p.name for p in tmp_path.iterdir()] == [name]
     with Store(tmp_path / name, write=False) as store:
-        assert store.counts()["answered"] == 120
+        assert store.counts()["answered"] == 24
 
 
-def test_the_newest_checkpoint_is_the_one_with_the_highest_number(tmp_path: Path) -> None:
-    finish("control/toy", tmp_path / "run")
-    folder = tmp_path / "run/checkpoints"
+def test_the_newest_checkpoint_is_the_one_with_the_highest_number(toy_run: Path) -> None:
+    folder = toy_run / "checkpoints"
     (folder / "round-0003").rename(folder / "round-9999")
     (folder / "round-0004").rename(folder / "round-10000")
-    assert open_saved(tmp_path / "run").folder.name == "round-10000"
+    assert open_saved(toy_run).folder.name == "round-10000"

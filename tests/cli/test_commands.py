@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from runs import TINY
 from shell import Shell
 from text_models import classifier, gpt2
 
@@ -25,13 +26,16 @@ from prefrl.judgements import Ranking
 from prefrl.store import Store
 from prefrl.types import Query, Segment
 
+SMALL = " ".join((*TINY["control/toy"], "loop.rounds=1"))
+"""Settings with which `prefrl run control/toy` takes little time."""
+
 
 def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
     assert prefrl("label control/toy loop.labels=30 --out labels") == 0
     assert "30 of 30 queries answered" in prefrl.out
     assert prefrl("fit labels --out reward fitting.epochs=20") == 0
     assert "accuracy" in prefrl.out
-    assert prefrl("improve control/toy --reward reward --out policy") == 0
+    assert prefrl(f"improve control/toy --reward reward --out policy {SMALL}") == 0
     assert prefrl("evaluate policy") == 0
     assert "gold" in prefrl.out
     summary = json.loads(Path("policy/summary.json").read_text())
@@ -42,7 +46,7 @@ def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
 
 
 def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgements(prefrl: Shell) -> None:
-    assert prefrl("run control/toy --out run") == 0
+    assert prefrl(f"run control/toy --out run {SMALL} loop.labels=40 fitting.held_out=0.3") == 0
     at_the_end = json.loads(Path("run/card.json").read_text())
     assert "How good is the reward model?" in Path("run/report.html").read_text("utf-8")
     assert prefrl("evaluate --reward run --json card.json --html card.html") == 0
@@ -51,14 +55,14 @@ def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgement
     again["seconds"] = at_the_end["seconds"]  # the only thing that two times differ in
     assert again == at_the_end
     assert "<svg" in Path("card.html").read_text("utf-8")
-    assert prefrl("label control/toy loop.labels=40 seed=5 --out labels") == 0
-    assert prefrl("fit labels --out reward fitting.epochs=20") == 0
+    assert prefrl("label control/toy loop.labels=30 seed=5 --out labels") == 0
+    assert prefrl("fit labels --out reward fitting.epochs=20 fitting.held_out=0.3") == 0
     assert prefrl("evaluate --reward reward") == 2
     assert "--data" in prefrl.err
     assert prefrl("evaluate --reward run --data labels") == 0
-    assert "40 comparisons (all there are" in prefrl.out
+    assert "30 comparisons (all there are" in prefrl.out
     assert prefrl("evaluate --reward reward --data labels --held-out --json part.json") == 0
-    assert 0 < json.loads(Path("part.json").read_text())["about"]["judgements"] < 40
+    assert 0 < json.loads(Path("part.json").read_text())["about"]["judgements"] < 30
     assert prefrl("evaluate --reward run --rewardbench bench") == 2
     assert "pairs of texts" in prefrl.err
     assert prefrl("evaluate") == 2
@@ -152,7 +156,7 @@ def test_a_mistake_gets_a_line_on_stderr_and_status_two(prefrl: Shell, line: str
 
 def test_a_run_without_a_folder_makes_a_new_one_and_says_which(prefrl: Shell) -> None:
     for number in (1, 2):
-        assert prefrl("run control/toy loop.rounds=1") == 0
+        assert prefrl(f"run control/toy {SMALL}") == 0
         told = re.search(r"the run's folder: (runs/control-toy-\d{8}-\d{6}(-2)?)$", prefrl.out, re.MULTILINE)
         assert told is not None
         assert Path(told[1], "report.html").exists()
@@ -166,9 +170,9 @@ def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -
 
 
 def test_a_second_run_into_the_folder_of_another_is_refused(prefrl: Shell) -> None:
-    assert prefrl("run control/toy --out run") == 0
+    assert prefrl(f"run control/toy --out run {SMALL}") == 0
     assert "report: run/report.html" in prefrl.out
-    assert prefrl("run control/toy --out run seed=1") == 2
+    assert prefrl(f"run control/toy --out run {SMALL} seed=1") == 2
     assert "seed is 0 there, 1 here" in prefrl.err
     assert prefrl("resume run") == 0
 
@@ -245,7 +249,7 @@ def test_settings_are_described_without_what_they_build(kind: str) -> None:
 
 def test_a_control_user_never_loads_transformers(tmp_path: Path) -> None:
     code = (
-        "import sys; sys.argv = ['prefrl', 'run', 'control/toy', '--out', 'run']\n"
+        f"import sys; sys.argv = 'prefrl run control/toy --out run {SMALL}'.split()\n"
         "from prefrl.cli.main import main\ntry: main()\nexcept SystemExit: print('transformers' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
@@ -292,12 +296,12 @@ def test_a_ctrl_c_that_is_ignored_stays_ignored() -> None:
 
 def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
     assert prefrl("run control/toy --out run task.segment_steps=41") == 2
-    assert prefrl("run control/toy --out run loop.rounds=1") == 0
+    assert prefrl(f"run control/toy --out run {SMALL}") == 0
 
 
 def test_a_run_that_never_learns_anything_says_so(prefrl: Shell) -> None:
-    assert prefrl("run control/toy --out run labeler.tie_within=1e6") == 2
-    assert "nothing to fit: all 60 judgements are ties" in prefrl.out
+    assert prefrl(f"run control/toy --out run {SMALL} labeler.tie_within=1e6") == 2
+    assert "nothing to fit: all 24 judgements are ties" in prefrl.out
     assert "nothing was learned" in prefrl.err
 
 

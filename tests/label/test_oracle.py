@@ -16,6 +16,7 @@ from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
+Pairs = Callable[[int], list[Query[Segment]]]
 
 
 def judge(query: Query[Segment], rng: np.random.Generator, **settings: Any) -> Answer:
@@ -130,8 +131,8 @@ def test_position_bias_follows_what_was_shown_first(make_query: Ask, rng: np.ran
     assert tie.preference == 0.5
 
 
-def test_mistakes_come_at_the_rate_asked_for(store: Store[Segment], make_query: Ask) -> None:
-    queries = [make_query(0.0, 1.0) for _ in range(300)]
+def test_mistakes_come_at_the_rate_asked_for(store: Store[Segment], make_pairs: Pairs) -> None:
+    queries = make_pairs(300)
     store.ask(queries)
     Oracle(OracleSettings(mistake_rate=0.2)).answer(store, np.random.default_rng(1))
     truth = {q.id: float(total(q)[0]) for q in queries}
@@ -139,8 +140,8 @@ def test_mistakes_come_at_the_rate_asked_for(store: Store[Segment], make_query: 
     assert np.mean(wrong) == pytest.approx(0.2, abs=0.06)
 
 
-def test_left_and_right_are_shown_at_random(store: Store[Segment], make_query: Ask) -> None:
-    store.ask([make_query() for _ in range(200)])
+def test_left_and_right_are_shown_at_random(store: Store[Segment], make_pairs: Pairs) -> None:
+    store.ask(make_pairs(200))
     Oracle(OracleSettings()).answer(store, np.random.default_rng(0))
     assert np.mean([a.shown == (0, 1) for a in store.answers()]) == pytest.approx(0.5, abs=0.1)
 

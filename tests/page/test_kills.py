@@ -6,10 +6,12 @@ import pytest
 from benchmark_runs import measured
 
 
-@pytest.mark.slow
-def test_after_25_kills_each_acknowledged_answer_is_stored_once_and_nobody_has_lost_a_session() -> None:
-    found = measured("label_kill", "--short", seconds=600)
-    assert found["kills"] == 25
-    assert found["answers"] > 50
+@pytest.mark.parametrize(
+    "kills", [pytest.param(10, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.nightly)]
+)
+def test_after_kills_each_acknowledged_answer_is_stored_once_and_nobody_has_lost_a_session(kills: int) -> None:
+    found = measured("label_kill", "--kills", str(kills), seconds=60 * kills)
+    assert found["kills"] == kills
+    assert found["answers"] > 2 * kills
     assert (found["lost"], found["duplicates"], found["fault_kinds"]) == (0, 0, {})
     assert found["chain"] is True

@@ -77,7 +77,6 @@ def hold_to_it(client: TestClient, requests: st.SearchStrategy[Any], examples: i
         phases=[Phase.generate],
         database=None,
         deadline=None,
-        derandomize=True,
         suppress_health_check=list(HealthCheck),
     )
     @given(requests)
@@ -112,13 +111,15 @@ def test_whoever_asks_for_what_the_answer_is_a_declared_one(
     hold_all(service, operations, role, mode, 3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "examples", [pytest.param(10, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.nightly)]
+)
 def test_whoever_asks_often_the_answer_is_a_declared_one(
-    service: Service, operations: list[Any], role: str, mode: GenerationMode
+    service: Service, operations: list[Any], role: str, mode: GenerationMode, examples: int
 ) -> None:
-    hold_all(service, operations, role, mode, 30)
+    hold_all(service, operations, role, mode, examples)
 
 
 @pytest.mark.parametrize("path", ["/api/answers", "/api/undo", "/api/flags"])

@@ -13,6 +13,7 @@ from prefrl.evaluate.card import Bucket, ReportCard, undefined
 from prefrl.evaluate.grade import Subject, grade
 from prefrl.judgements import Comparison, Judged
 from prefrl.report.card_words import groups, headline, span
+from prefrl.report.records import read
 from prefrl.report.report import render_card, write_report
 from prefrl.types import Query, Response
 
@@ -100,6 +101,13 @@ def test_the_report_of_a_run_tells_of_the_card_that_lies_in_its_folder(card: Rep
 def test_a_card_that_makes_no_sense_is_named_and_left_out(wild: Any, card: ReportCard, tmp_path: Path) -> None:
     content = json.loads(card.model_dump_json())
     (tmp_path / "card.json").write_text(json.dumps(content | {"accuracy": wild}))
+    record = read(tmp_path)
+    assert record.card is None
+    assert "card.json: cannot be read" in record.missing
+
+
+def test_a_page_names_a_card_that_makes_no_sense(tmp_path: Path) -> None:
+    (tmp_path / "card.json").write_text("{}")
     page = write_report(tmp_path).read_text("utf-8")
     assert "card.json: cannot be read" in page
     assert "How good is the reward model?" not in page

@@ -10,9 +10,10 @@ import matplotlib
 import pytest
 from PIL import Image
 
+from prefrl.report.facts import gather
 from prefrl.report.records import MAX_TEXT, number, read, visible
 from prefrl.report.report import write_report
-from prefrl.report.words import show_count, show_number, show_share, show_time
+from prefrl.report.words import headline, show_count, show_number, show_share, show_time, verdict
 
 WILD = "</pre></title><script>alert(1)</script><img src=x onerror=alert(1)>\u202e\u2066\"'{{ 7*7 }}\x00\x1b[31m\ud800"
 CSP = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -183,17 +184,44 @@ def test_hostile_text_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     assert ("meta", "content", CSP) in found.attributes  # a second lock: no script may run, nothing be loaded
 
 
-@pytest.mark.parametrize("wild", [None, -3, "x", [None], True, "[" * 100_000, {"total": [[1]]}])
-def test_wrong_types_anywhere_never_crash_it(tmp_path: Path, wild: Any) -> None:
+WRONG = (None, -3, "x", [None], True, "[" * 100_000, {"total": [[1]]})
+
+
+def wrong_run(folder: Path, wild: Any) -> Path:
+    """A run that has the same wrong value everywhere."""
     keys = ("gold_before", "rounds", "labels", "steps", "seconds", "versions", "kl", "seed", "task", "kind")
     lines = [{"round": 0} | dict.fromkeys(line(1), wild) | {"round": 0}, line(1), {"round": wild}]
     examples = [wild, {"gold": wild, "learned": wild, "prompt": wild, "text": wild, "strip": wild}]
     held_out = {"round": wild, "predicted": wild, "preference": wild}
     files = {"summary": dict.fromkeys(keys, wild), "held_out": held_out, "before": examples, "after": wild}
-    folder = run_folder(tmp_path / "run", lines, **files)
-    check_harmless(page(folder))
+    return run_folder(folder, lines, **files)
+
+
+def spoil(folder: Path, wild: Any) -> None:
+    """Put the value in the place of whole files."""
     for name in ("summary.json", "metrics.jsonl", "held_out.json", "examples/before.json"):
         (folder / name).write_text(wild if isinstance(wild, str) else json.dumps(wild))
+
+
+@pytest.mark.parametrize("wild", WRONG)
+def test_wrong_types_anywhere_are_read_as_missing(tmp_path: Path, wild: Any) -> None:
+    """What is drawn is what was read: numbers that can be drawn, or nothing."""
+    folder = wrong_run(tmp_path / "run", wild)
+    for _ in range(2):
+        record = read(folder)
+        facts = gather(record)
+        for told in (headline(facts), verdict(facts)):
+            assert told is not None
+        for key in line(1):
+            assert all(value is None or isinstance(value, float) for value in record.series(key))
+        spoil(folder, wild)
+
+
+@pytest.mark.parametrize("wild", [{"total": [[1]]}, *(pytest.param(wild, marks=pytest.mark.slow) for wild in WRONG)])
+def test_wrong_types_anywhere_never_crash_the_page(tmp_path: Path, wild: Any) -> None:
+    folder = wrong_run(tmp_path / "run", wild)
+    check_harmless(page(folder))
+    spoil(folder, wild)
     check_harmless(page(folder))
 
 

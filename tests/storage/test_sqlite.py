@@ -17,6 +17,7 @@ from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
+Pairs = Callable[[int], list[Query[Segment]]]
 HOLDER = """
 import sqlite3, sys, time
 connection = sqlite3.connect(sys.argv[1], isolation_level=None)
@@ -93,14 +94,13 @@ def test_any_database_will_do(tmp_path: Path, make_query: Ask) -> None:
         assert store.counts()["asked"] == 1
 
 
-def test_a_full_disk_is_an_error_and_loses_nothing(store: Store[Segment], make_query: Ask) -> None:
-    kept = make_query()
+def test_a_full_disk_is_an_error_and_loses_nothing(store: Store[Segment], make_pairs: Pairs) -> None:
+    kept, *late = make_pairs(201)
     store.ask([kept])
     assert store.log._writer is not None
     with store.log._writer.connect() as connection:
         pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
         connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
-    late = [make_query() for _ in range(200)]
     with pytest.raises(StoreFull, match="is full"):
         store.ask(late)
     assert [q.id for q in store.open_queries()] == [kept.id]
