@@ -170,6 +170,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from typing import Any, cast
+from prefrl.judgements import *
 from prefrl.store import Store
 from prefrl.types import *
 store = Store(Path(sys.argv[1]))
