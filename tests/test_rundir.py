@@ -9,10 +9,12 @@ from runs import copied, exit_code, finish, tiny
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.rundir import Run, RunError, open_saved
+from prefrl.rundir import Run, RunError, open_saved, save_reward
 from prefrl.stages import label, with_reward
 from prefrl.storage.checkpoints import load_state
+from prefrl.storage.files import DamagedError
 from prefrl.store import Store
+from prefrl.types import Segment
 
 TOYS = ["control/toy", "text/toy"]
 SUMMARY = {
@@ -71,7 +73,9 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(
 DYING = """
 import itertools, os, signal, sys, torch
 from prefrl import Config, Run
+from prefrl.storage.files import DamagedError
 from prefrl.store import Store
+from prefrl.types import Segment
 
 torch.set_num_threads(1)
 name, folder, moment = sys.argv[1:]
@@ -205,6 +209,19 @@ def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(
     other = with_reward(tiny("control/toy", "task.horizon=30"), first)
     with pytest.raises(RunError, match=r"another task \(task\.horizon is 40 there, 30 here\)"):
         Run(other, tmp_path / "other", first)
+
+
+def test_a_kept_reward_that_was_changed_is_refused(tmp_path: Path) -> None:
+    config, kept = Config.load("control/toy"), tmp_path / "run/reward"
+    with Store[Segment](tmp_path / "other") as store:
+        save_reward(kept, config, config.build(store).reward)
+    (tmp_path / "run/config.yaml").write_text(config.dump())
+    Run(config, tmp_path / "run").close()
+    saved = next(kept.glob("*.safetensors"))
+    data = saved.read_bytes()
+    saved.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(DamagedError, match="it was changed"):
+        Run(config, tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", ["what?", "100%", "a#b", "ü n", "[red]x"])

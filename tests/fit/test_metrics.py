@@ -38,6 +38,16 @@ def test_calibration_does_not_depend_on_which_candidate_comes_first(rng: np.rand
     assert calibration_error(predicted, preference) == pytest.approx(calibration_error(1 - predicted, 1 - preference))
 
 
+def test_a_calibration_error_is_the_same_whichever_comparisons_are_turned_round() -> None:
+    """Two favourites at 0.9 of which one wins and one wins four times of five: 0.9 on average, as predicted."""
+    predicted, preference = np.array([0.9, 0.9]), np.array([1.0, 0.8])
+    assert calibration_error(predicted, preference) == pytest.approx(0.0)
+    turned = np.array([False, True])
+    assert calibration_error(
+        np.where(turned, 1 - predicted, predicted), np.where(turned, 1 - preference, preference)
+    ) == pytest.approx(0.0)
+
+
 def test_a_temperature_finds_by_how_much_logits_are_too_large(rng: np.random.Generator) -> None:
     true = rng.normal(size=(1, 5000))
     preference = (rng.uniform(size=5000) < 1 / (1 + np.exp(-true[0]))).astype(float)

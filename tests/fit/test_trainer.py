@@ -469,6 +469,16 @@ def test_training_metrics_are_of_training_judgements_alone(judged: list[Judged[S
     assert metrics["accuracy_held_out"] < 0.5
 
 
+def test_the_temperature_is_that_of_judgements_that_were_held_out(judged: list[Judged[Segment]]) -> None:
+    """A model that fits what it was trained on, and is wrong on all else, is to be far less sure."""
+    settings = FittingSettings(epochs=60, held_out=0.3)
+    out = split(judged[:40], settings.held_out)
+    turned = [reversed_answer(j) if held_out else j for j, held_out in zip(judged, out, strict=False)]
+    metrics = fit_judged(model(1), turned, settings, np.random.default_rng(0)).metrics
+    assert metrics["loss"] < 0.2  # it could be surer still of these
+    assert metrics["temperature"] > 3.0
+
+
 def reversed_answer(one: Judged[Segment]) -> Judged[Segment]:
     assert isinstance(one.judgement, Comparison)
     return Judged(one.query, Comparison(one.query.id, 1 - one.judgement.preference))

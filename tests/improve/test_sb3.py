@@ -124,6 +124,15 @@ def test_the_replay_holds_the_newest_rewards_whole_and_never_the_gold(store: Sto
     np.testing.assert_allclose(buffer.rewards, 3.0 * buffer.observations[..., 0] + buffer.actions[..., 0], atol=1e-6)
 
 
+def test_each_round_begins_by_scoring_what_is_replayed_anew(store: Store[Segment]) -> None:
+    learner = _learner(point(), {**SAC_, "options": {**SAC_["options"], "buffer_size": 1000}})
+    learner.improve(Known(lambda o, a: o[..., 0]), store, np.random.default_rng(0))
+    learner.improve(Known(lambda o, a: 7.0 - o[..., 0]), store, np.random.default_rng(1))
+    buffer = learner.model.replay_buffer
+    assert buffer.size() == 80  # both rounds, of 40 steps in each of two environments
+    np.testing.assert_allclose(buffer.rewards[:80], 7.0 - buffer.observations[:80, :, 0], atol=1e-6)
+
+
 def test_relabelling_sees_actions_as_they_were_executed() -> None:
     space = gymnasium.spaces.Box(np.array([-2.0], np.float32), np.array([6.0], np.float32))
     buffer = ReplayBuffer(6, gymnasium.spaces.Box(-1.0, 1.0, (1,)), space, n_envs=2)

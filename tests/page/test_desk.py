@@ -94,6 +94,18 @@ def test_a_sign_of_life_keeps_a_lease() -> None:
     assert made.pick("ben", 1) == ([], [])
 
 
+def test_a_lease_that_was_renewed_outlives_its_first_expiry_and_ends_at_its_second() -> None:
+    clock = Clock()
+    made = desk(asked(1), "ann", "ben", clock=clock, lease_seconds=60)
+    given = made.pick("ann", 1)[1][0]
+    clock.now += 50
+    made.extend("ann", [given.id])
+    clock.now += 59
+    assert made.pick("ben", 1) == ([], [])
+    clock.now += 1
+    assert [one.query for one in made.pick("ben", 1)[1]] == [given.query]
+
+
 def test_a_skipped_question_goes_to_somebody_else_and_never_back() -> None:
     made = desk(asked(1), "ann", "ben")
     made.answered(made.pick("ann", 1)[1][0], 0, skipped=True)

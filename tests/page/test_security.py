@@ -250,6 +250,29 @@ def test_every_response_carries_the_protecting_headers(ann: TestClient, path: st
             assert name == b"cache-control" or there[name] == value
 
 
+def test_the_protecting_headers_are_those_that_browsers_know(ann: TestClient) -> None:
+    """Written out, so that none can be lost from the list that the server goes by."""
+    for path in ("/", "/static/app.js", "/api/me", "/nowhere"):
+        found = ann.get(path).headers
+        assert found["content-security-policy"].split("; ") == [
+            "default-src 'none'",
+            "script-src 'self'",
+            "style-src 'self'",
+            "img-src 'self' data:",
+            "media-src 'self'",
+            "connect-src 'self'",
+            "form-action 'self'",
+            "base-uri 'none'",
+            "frame-ancestors 'none'",
+            "require-trusted-types-for 'script'",
+        ]
+        assert (found["x-content-type-options"], found["x-frame-options"]) == ("nosniff", "DENY")
+        assert found["referrer-policy"] == "no-referrer"
+        assert found["cross-origin-opener-policy"] == found["cross-origin-resource-policy"] == "same-origin"
+        assert found["permissions-policy"] == "camera=(), geolocation=(), microphone=()"
+        assert found["cache-control"] == ("no-cache" if path in ("/", "/static/app.js") else "no-store")
+
+
 # --- F19: paths ----------------------------------------------------------------------------------------------------
 
 

@@ -82,3 +82,18 @@ def test_the_interval_of_a_correlation_is_fishers_for_independent_points() -> No
     found = correlation("pearson", x, y, range(400), rng)
     expected = stats.pearsonr(x, y).confidence_interval(0.95)
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.03)
+
+
+def test_the_interval_of_a_correlation_is_one_of_95_percent() -> None:
+    """On average over samples: one of 90 % would be a sixth narrower."""
+    rng, found, expected = np.random.default_rng(7), list[float](), list[float]()
+    for _ in range(6):
+        x = rng.normal(size=100)
+        y = 0.6 * x + 0.8 * rng.normal(size=100)
+        one = correlation("pearson", x, y, range(100), rng)
+        fisher = stats.pearsonr(x, y).confidence_interval(0.95)
+        assert one.low is not None
+        assert one.high is not None
+        found.append(one.high - one.low)
+        expected.append(fisher.high - fisher.low)
+    assert np.mean(found) == pytest.approx(np.mean(expected), rel=0.07)

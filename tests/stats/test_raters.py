@@ -170,6 +170,13 @@ def test_intervals_cover_the_value_that_much_data_would_give(rng: Generator, mea
     assert covered >= 86, "95 of 100 are expected, and 86 or fewer come up once in a thousand times"
 
 
+def test_an_interval_leaves_out_a_fortieth_on_either_side(rng: Generator) -> None:
+    """Of the share of 400 items on which two agree: 1.96 standard errors either way."""
+    same = np.arange(400) < 280
+    found = raw_agreement(ratings([same, np.ones(400)]), rng, resamples=9999)
+    assert (found.value, found.low, found.high) == pytest.approx((0.7, 0.7 - 0.0449, 0.7 + 0.0449), abs=2.5e-3)
+
+
 @pytest.mark.parametrize("measure", MEASURES)
 def test_numbers_hang_on_the_seed_alone(measure: Callable[..., Measured]) -> None:
     table = noisy(np.random.default_rng(3), 4, 50, missing=0.2)

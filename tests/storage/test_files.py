@@ -49,6 +49,44 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     assert list(tmp_path.iterdir()) == [path]
 
 
+def watch(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Path]]:
+    """What is made durable and what gets its name, in order."""
+    done: list[tuple[str, Path]] = []
+    sync, replace = os.fsync, os.replace
+
+    def fsync(handle: int) -> None:
+        done.append(("sync", Path(os.readlink(f"/proc/self/fd/{handle}"))))
+        sync(handle)
+
+    def move(old: Path, new: Path) -> None:
+        done.append(("to", new))
+        replace(old, new)
+
+    monkeypatch.setattr("os.fsync", fsync)
+    monkeypatch.setattr("os.replace", move)
+    monkeypatch.setattr("os.rename", move)
+    return done
+
+
+def test_a_file_is_durable_before_it_has_its_name_and_its_name_before_anybody_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = watch(monkeypatch)
+    write_file(tmp_path / "new" / "file", b"text")
+    made, (word, work), *rest = done
+    assert made == ("sync", tmp_path)  # where the folder `new` is entered
+    assert (word, work.parent, work.name[:6]) == ("sync", tmp_path / "new", ".file-")
+    assert rest == [("to", tmp_path / "new/file"), ("sync", tmp_path / "new")]
+
+
+def test_a_whole_folder_is_durable_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = watch(monkeypatch)
+    with whole_folder(tmp_path / "c") as work:
+        write_file(work / "a", b"1")
+    assert ("sync", work) in done
+    assert done[-2:] == [("to", tmp_path / "c"), ("sync", tmp_path)]
+
+
 def fill(path: Path, text: bytes) -> None:
     with whole_folder(path) as work:
         write_file(work / "a", text)
