@@ -7,7 +7,7 @@ import json
 import logging
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +71,22 @@ def check_failure(answer: Any, *statuses: int) -> None:
     assert ".py" not in answer.text
 
 
+def work(call: Callable[[], object]) -> float:
+    """The seconds of a processor that a call takes: the least of three, since garbage may be collected meanwhile."""
+    spent = []
+    for _ in range(3):
+        begin = time.process_time()
+        call()
+        spent.append(time.process_time() - begin)
+    return min(spent)
+
+
 # --- F17: bodies ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_body_is_refused_at_once_and_the_next_good_one_is_taken(ann: TestClient, name: str) -> None:
-    begin = time.process_time()
-    check_failure(ann.post("/api/assignments", content=HOSTILE[name], headers=JSON), 400)
-    assert time.process_time() - begin < 0.1
+    assert work(lambda: check_failure(ann.post("/api/assignments", content=HOSTILE[name], headers=JSON), 400)) < 0.1
     assert len(ask_for(ann)) == 1
 
 
@@ -329,9 +337,8 @@ def test_clips_are_for_people_who_are_logged_in_and_come_in_parts(service: Servi
     assert part.content == clip.read_bytes()[10:20]
     assert ann.get(name, headers={"range": "bytes=9999999-"}).status_code == 416
     for ranges in ("bytes=" + ",".join(f"{i}-" for i in range(10_000)), "bytes=" + "0-0," * 99 + "0-0", "rows=1-2"):
-        begin = time.process_time()
         assert ann.get(name, headers={"range": ranges}).status_code in (200, 206, 400, 416)
-        assert time.process_time() - begin < 0.2
+        assert work(lambda sent={"range": ranges}: ann.get(name, headers=sent)) < 0.2  # type: ignore[misc]
 
 
 # --- the rest ------------------------------------------------------------------------------------------------------
