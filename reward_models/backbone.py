@@ -78,28 +78,32 @@ class Backbone:
         """(N, L) right-padded rows with their lengths (N,) -> (N, d) what the heads see."""
         if self.model.config.model_type in MODELS:
             return final_states(self.model, pack(tokens, lengths))
+        # Rows of like length share a pass, and are put back in their order by the inverse permutation.
         order = lengths.argsort()
         parts = [self._padded_states(tokens[part], lengths[part]) for part in torch.split(order, BUCKET)]
         return torch.cat(parts)[order.argsort()]
 
     def _padded_states(self, tokens: Tensor, lengths: Tensor) -> Tensor:
-        tokens = tokens[:, : int(lengths.max())]
+        tokens = tokens[:, : int(lengths.max())]  # a part needs no more columns than its longest row
         mask = torch.arange(tokens.shape[1]) < lengths[:, None]
         found = self.model(input_ids=tokens, attention_mask=mask.long())
+        # Of a classifier whose last layer is the identity, the logits (n, d) are what that layer was given.
         hidden: Tensor = found.logits if self.pool == "own" else found.last_hidden_state
         if self.pool == "own":
             return hidden
         if self.pool == "mean":
-            return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]
+            return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]  # (n, L, d) -> (n, d), padding left out
+        # By length, not by looking for padding: where padding is the end token, a search finds the wrong place.
         return hidden[torch.arange(len(tokens)), lengths - 1 if self.pool == "last" else 0]
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
         ended = not response.tokens or response.tokens[-1] == self.policy_end
-        if self.chat:
+        if self.chat:  # first of all: a template reads the text, whatever was sampled
             return in_turns(self.tokenizer, response, ended)
         sampled = self.policy_end is None
         prompt = list((sampled and response.prompt_tokens) or self.tokenizer.encode(response.prompt))
+        # As sampled: text that is encoded anew can merge across the border, and its tokens are then others.
         if sampled and response.tokens:
             return [*prompt, *response.tokens]
         end = end_token(self.tokenizer)
@@ -170,10 +174,13 @@ def _ready(model: Any, tokenizer: PreTrainedTokenizerBase, task: TextTask, pool:
     if chat and tokenizer.chat_template is None:
         raise ConfigError("reward.chat_template is true, but the reward's tokenizer has no chat template")
     if model.config.model_type in MODELS:
+        # Only what was tested against padded rows is packed; other architectures may mix tokens in other ways.
         use_packed_attention(model)
+    # Two tokenizers with one vocabulary read the same ids, so what was sampled need not be encoded again.
     same = tokenizer is task.tokenizer or tokenizer.get_vocab() == task.tokenizer.get_vocab()
     policy_end = None if same and not chat else end_token(task.tokenizer)
     pool = pool if is_encoder(model) else "last"
+    # Evaluation mode for good: dropout would give one response a different score in each pass.
     return Backbone(model.eval(), tokenizer, policy_end, int(model.config.hidden_size), pool, chat=chat)
 
 
@@ -196,6 +203,7 @@ def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
         hint = first_line(error) if download else "only local files are looked at unless reward.download is true"
         raise ConfigError(f"no model in safetensors could be read from {name!r}: {hint}") from error
     headless = auto is AutoModel  # then nothing reads a pooler
+    # transformers fills what is missing with random numbers and only warns.
     if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
         raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
     found: PreTrainedModel = model
@@ -229,6 +237,7 @@ def digest(named: Mapping[str, Tensor]) -> str:
     found = hashlib.sha256()
     for name, value in named.items():
         found.update(name.encode())
+        # As bytes, since NumPy has no bfloat16.
         found.update(value.detach().contiguous().view(torch.uint8).numpy().tobytes())
     return found.hexdigest()
 

@@ -55,7 +55,7 @@ class CNNSettings(Settings):
             mean, std = torch.tensor(0.0), torch.tensor(self.brightest)
         else:
             std, mean = torch.std_mean(steps[:, :pixels], correction=0)
-        std = std if std > 1e-6 else torch.tensor(1.0)
+        std = std if std > 1e-6 else torch.tensor(1.0)  # pictures of one colour
         return torch.cat([mean.expand(pixels), action_mean]), torch.cat([std.expand(pixels), action_std])
 
 
@@ -82,11 +82,12 @@ class CNN:
         pixels = math.prod(self._image)
         steps = inputs.view(-1, *inputs.shape[-3:]).flatten(1, 2)  # (1, S, I), or (E, S, I) of each member's own
         pictures = steps[:, :, :pixels].reshape(*steps.shape[:2], *self._image)
+        # (1 or E, S, height, width, C) -> (S, C or E C, height, width), as convolutions have it.
         x = pictures.permute(1, 0, 4, 2, 3).flatten(1, 2)
         for i, (weight, bias) in enumerate(zip(self._filters, self._biases, strict=True)):
             # Where all see one picture, the first layer is one convolution with the filters of all.
             x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else len(steps)))
-        seen = x.reshape(len(x), self.members, -1).transpose(0, 1)
+        seen = x.reshape(len(x), self.members, -1).transpose(0, 1)  # (S, E filters, h, w) -> (E, S, filters h w)
         both = torch.cat([seen, steps[:, :, pixels:].expand(self.members, -1, -1)], 2)
         return self._head.of_steps(both).view(self.members, *inputs.shape[-3:-1])
 

@@ -40,6 +40,7 @@ def load_classifier(
     if model.config.num_labels != 1:
         raise ConfigError(f"{name} tells {model.config.num_labels} labels apart; a reward model has num_labels=1")
     path, tokenizer = _last_layer(model, name), load_tokenizer(name, download)
+    # Before the last layer is taken off below, which would change what the model itself says.
     head, alone = model.get_submodule(path), _logit(model) if is_encoder(model) else None
     chat = tokenizer.chat_template is not None if chat_template is None else chat_template
     backbone = of_classifier(model, path, tokenizer, task, chat)
@@ -94,6 +95,7 @@ def save_classifier(backbone: Backbone, weight: torch.Tensor, constant: float, f
             f"a {backbone.model.config.model_type} is an encoder, whose classifiers have deeper heads than ours: only "
             "causal models, and encoders that came from a reward.checkpoint, are exported"
         )
+    # A copy: the tokenizer that the fitted model reads with must not get a padding token, or lose its template.
     tokenizer, model = copy.deepcopy(backbone.tokenizer), _without_adapters(backbone.model)
     if not backbone.chat:
         tokenizer.chat_template = None
@@ -122,7 +124,7 @@ def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedMo
     config.num_labels = 1
     if config._attn_implementation == ATTENTION:
         config._attn_implementation = None  # whatever the architecture has by default
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]):  # its random head is overwritten, and must not move the global generator
         model: Any = AutoModelForSequenceClassification.from_config(config)  # type: ignore[no-untyped-call]
     model.base_model.load_state_dict(backbone.state_dict())
     model.score.weight.data.copy_(weight[None])
@@ -133,6 +135,7 @@ def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedMo
 def _closed(model: PreTrainedModel, path: str, weight: torch.Tensor, bias: float) -> PreTrainedModel:
     """A copy of an encoder's classifier with a last layer again: (d,) and a number."""
     found = copy.deepcopy(model)
+    # Draws no random numbers for what is overwritten at once.
     head = torch.nn.utils.skip_init(torch.nn.Linear, len(weight), 1)  # type: ignore[no-untyped-call]
     head.weight.data.copy_(weight[None])
     head.bias.data.fill_(bias)
@@ -144,6 +147,6 @@ def _give_padding(model: Any, tokenizer: PreTrainedTokenizerBase) -> None:
     """Of its own where it is missing or is the end: causal classifiers look for the last token that is no padding."""
     if tokenizer.pad_token_id is None or tokenizer.pad_token_id == end_token(tokenizer):
         tokenizer.add_special_tokens({"pad_token": PAD})
-        if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:
+        if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:  # some models have rows to spare
             model.resize_token_embeddings(len(tokenizer), mean_resizing=False)
     model.config.pad_token_id = tokenizer.pad_token_id

@@ -73,6 +73,7 @@ class Linear:
         self._quadratic = settings.features == "quadratic"
         size = inputs + (inputs * (inputs + 1) // 2 if self._quadratic else 0)
         half = rng.standard_normal((settings.members // 2, size))
+        # In pairs around the mode, so that the members' mean is the mode itself and not a draw.
         draws = np.concatenate([half, -half, np.zeros((settings.members % 2, size))])
         self._draws = torch.from_numpy(draws)
         self._weight = (self._draws * settings.prior_std).float()[:, :, None]
@@ -86,22 +87,25 @@ class Linear:
         return None if self._quadratic else (self._weight, self._bias)
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        x = self.features(inputs).flatten(-3, -2).expand(self.members, -1, -1)
+        x = self.features(inputs).flatten(-3, -2).expand(self.members, -1, -1)  # (E, B T, d)
         return torch.baddbmm(self._bias, x, self._weight).view(self.members, *inputs.shape[-3:-1])
 
     def features(self, inputs: Tensor) -> Tensor:
         """(..., I) -> (..., d)."""
         if not self._quadratic:
             return inputs
-        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1])
+        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1])  # each product once, squares among them
         return torch.cat([inputs, inputs[..., i] * inputs[..., j] - (i == j).float()], -1)
 
     def solve(self, inputs: Tensor, counts: Tensor, loss: Loss) -> None:
         """Find the posterior. Raises ValueError for a candidate that is not finite, and where no maximum is found."""
+        # (N, d), candidate by candidate: the features of all steps at once would be T times as large. In float64, since
+        # the Hessian is factorised.
         design = torch.stack([count @ self.features(x) for x, count in zip(inputs, counts, strict=True)]).double()
         if not design.isfinite().all():
             at = int((~design.isfinite()).any(1).nonzero()[0])
             raise ValueError(f"candidate {at} of the fit has features that are not finite: look for NaN or inf in it")
+        # The loss takes E rows of scores; all are the same here, and their mean is one member's.
         w, hessian = maximum(design, lambda scores: loss(scores.expand(self.members, -1)).mean(), self._prior_std)
         # H = L L' gives H^-1 = L^-T L^-1, so that L^-T z has this covariance.
         spread = torch.linalg.solve_triangular(torch.linalg.cholesky(hessian).T, self._draws.T, upper=True).T

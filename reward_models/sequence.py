@@ -65,22 +65,25 @@ class GRU:
 
     def outputs(self, inputs: Tensor) -> Tensor:
         p, (rows, steps) = self._p, inputs.shape[-3:-1]
+        # (E, T B, I): time comes first, so that unbind(1) below gives one step after another.
         x = inputs.transpose(-3, -2).flatten(-3, -2).expand(self.members, -1, -1)
+        # The inputs' share of all gates at once; only the state's share has to go step by step.
         gates = torch.baddbmm(p["input_bias"], x, p["input_weight"]).view(self.members, steps, rows, -1).unbind(1)
         state, states = inputs.new_zeros(self.members, rows, p["state_weight"].shape[1]), list[Tensor]()
         for gate in gates:
             state = self._step(gate, state)
             states.append(state)
         outputs = torch.baddbmm(p["output_bias"], torch.cat(states, 1), p["output_weight"])
-        return outputs.view(self.members, steps, rows).transpose(1, 2)
+        return outputs.view(self.members, steps, rows).transpose(1, 2)  # (E, T B, 1) -> (E, B, T)
 
     def _step(self, gate: Tensor, state: Tensor) -> Tensor:
         """(E, B, 3 H) of the inputs and (E, B, H) -> the next state."""
         width = state.shape[2]
         own = torch.baddbmm(self._p["state_bias"], state, self._p["state_weight"])
         reset, update = (gate[..., : 2 * width] + own[..., : 2 * width]).sigmoid().chunk(2, -1)
+        # The reset gate is applied after the product, as in cuDNN and torch; Cho et al. apply it before.
         new = torch.tanh(gate[..., 2 * width :] + reset * own[..., 2 * width :])
-        return torch.lerp(new, state, update)
+        return torch.lerp(new, state, update)  # (1 - update) new + update state
 
 
 class PreferenceTransformerSettings(Settings):
@@ -159,6 +162,7 @@ class PreferenceTransformer:
         if not self._weighted:
             return worth[..., 0]
         q, k = self._apply("attend", x).chunk(2, -1)
+        # The worths (E, B, T, 1) take the place of values: what comes out is their weighted mean, on their own scale.
         return scaled_dot_product_attention(q, k, worth, is_causal=True)[..., 0]
 
     def _linear(self, name: str, fan_in: int, fan_out: int, generator: torch.Generator) -> None:
@@ -172,7 +176,7 @@ class PreferenceTransformer:
         return flat.view(*x.shape[:3], -1)
 
     def _attention(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        q, k, v = (x.reshape(*x.shape[:3], self._heads, -1).transpose(2, 3) for x in (q, k, v))
+        q, k, v = (x.reshape(*x.shape[:3], self._heads, -1).transpose(2, 3) for x in (q, k, v))  # (E, B, heads, T, D)
         return scaled_dot_product_attention(q, k, v, is_causal=True).transpose(2, 3).flatten(3)
 
 

@@ -127,10 +127,10 @@ class StepReward:
         """
         steps, lengths = self._steps(candidates), torch.tensor([len(c) for c in candidates])
         mask = torch.arange(int(lengths.max())) < lengths[:, None]
-        self._rebase(steps)
+        self._rebase(steps)  # first: it measures what is then normalised in place
         self._normalise_(steps)
         if mask.all():
-            return {"inputs": steps.view(*mask.shape, -1), "mask": mask.float()}
+            return {"inputs": steps.view(*mask.shape, -1), "mask": mask.float()}  # of one length: no copy
         inputs = steps.new_zeros(*mask.shape, steps.shape[1])
         inputs[mask] = steps
         return {"inputs": inputs, "mask": mask.float()}
@@ -140,34 +140,36 @@ class StepReward:
         if "used" in stacked and (self.memory == 1 or mask.shape[1] <= self.memory):
             return self._used_scores(inputs, mask, stacked["used"])
         if self.memory == 1:
+            # Without memory, steps need no beginnings; padding goes through as well, and is masked below.
             outputs = self._outputs(inputs.flatten(0, 1), np.zeros(0)).view(self.members, *mask.shape)
         elif mask.shape[1] <= self.memory:
             outputs = self.network.outputs(inputs)
         else:
             outputs = mask.new_zeros(self.members, *mask.shape)
-            outputs[:, mask.bool()] = self._outputs(*_flat(inputs, mask))
+            outputs[:, mask.bool()] = self._outputs(*_flat(inputs, mask))  # (E, S) -> (E, N, T), row by row
         return (outputs * mask).sum(2) * self._gain
 
     def _used_scores(self, inputs: Tensor, mask: Tensor, used: Tensor) -> Tensor:
         """`scores` where each member passes over what it does not use (N, E): about a third, after a bootstrap."""
-        count = max(1, int(used.sum(0).max()))
+        count = max(1, int(used.sum(0).max()))  # the member that uses most decides, for all go through together
         first = used.T.long().argsort(stable=True, dim=1, descending=True)[:, :count]  # filled up with unused ones
         rows = max(1, self._most(inputs) // mask.shape[1])
-        own = (
+        own = (  # (E, rows, T, I): each member's own candidates
             inputs.index_select(0, at.flatten()).view(*at.shape, *inputs.shape[1:])
             for at in torch.split(first, rows, 1)
         )
         outputs = torch.cat([self.network.outputs(each) for each in own], 1)
         sums = (outputs * mask[first]).sum(2) * self._gain
-        return sums.new_zeros(used.T.shape).scatter(1, first, sums)
+        return sums.new_zeros(used.T.shape).scatter(1, first, sums)  # (E, count) -> (E, N); 0 where passed over
 
     @torch.no_grad()
     def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
         inputs, mask = stacked["inputs"], stacked["mask"]
         if self._solve is not None:
-            self._solve(inputs, mask * self._gain, loss)
+            self._solve(inputs, mask * self._gain, loss)  # first: the outputs measured below are then the solution's
         real, begins = _flat(inputs, mask)
         outputs = self._outputs(real, begins)
+        # Over steps, not candidates, for a policy is paid by the step. The clamp is for a reward that never varies.
         self._shift, self._scale = outputs.mean(1), outputs.std(1, correction=0).clamp(min=1e-6)
         self._temperature, self._fits = 1.0, self._fits + 1
         return torch.from_numpy(_sums(outputs.numpy(), np.flatnonzero(begins))) * self._gain
@@ -190,14 +192,14 @@ class StepReward:
     @torch.no_grad()
     def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
         shape = observations.shape[:2]
-        marks = np.zeros(shape, bool) if begins is None else np.array(begins, bool)
+        marks = np.zeros(shape, bool) if begins is None else np.array(begins, bool)  # a copy: it is written to below
         if observations.ndim != 3 or actions.shape[:2] != shape or marks.shape != shape:
             raise ValueError(
                 f"rewards need observations (B, T, O), actions (B, T, A) and begins (B, T), got "
                 f"{observations.shape}, {actions.shape} and {marks.shape}"
             )
         marks[:, :1] = True
-        steps = self._normalise_(self._inputs(observations, actions))
+        steps = self._normalise_(self._inputs(observations, actions))  # in place on the copy that _inputs makes
         found = self._member_rewards(steps, marks.ravel()).numpy()
         return combine(found, self._ensemble, self._fits).reshape(shape)
 
@@ -225,7 +227,7 @@ class StepReward:
             if found != tuple(own.shape):
                 raise ValueError(f"reward model: {name} has shape {found}, expected {tuple(own.shape)}: other settings")
         for name, own in saved.items():
-            own.copy_(state[name])
+            own.copy_(state[name])  # in place, after all were checked: a refused state leaves the model as it was
         self._temperature, self._fits = float(state["temperature"]), int(state["fits"])
 
     def _saved(self) -> dict[str, Tensor]:
@@ -255,7 +257,7 @@ class StepReward:
         return max(1, min(self.network.most, NUMBERS // inputs.shape[-1]))
 
     def _normalise_(self, steps: Tensor) -> Tensor:
-        for piece in torch.split(steps, CACHED):
+        for piece in torch.split(steps, CACHED):  # two passes over what is still in cache
             piece.sub_(self._input_mean).div_(self._input_std)
         return steps
 
@@ -271,6 +273,7 @@ class StepReward:
         mean, std = self._measure(steps)
         if not mean.isfinite().all():  # what is not finite must only spoil its own candidate's score
             mean, std = self._measure(steps[steps.isfinite().all(1)])
+        # W (x - m) / s + b is kept: with V = W / s, it is (V s') (x - m') / s' + b + V (m' - m).
         if self.fitted and first is not None:
             weight = first[0] / self._input_std[:, None]
             first[1].add_((mean - self._input_mean)[None, None] @ weight)
@@ -283,6 +286,7 @@ class StepReward:
             raise ValueError("a reward model scores at least one segment at a time, got none")
         for one in candidates:
             self._check(one.observations, one.actions)
+        # NumPy writes into torch's memory; "unsafe" lets float64 and integers be narrowed to float32.
         steps = torch.empty(sum(len(c) for c in candidates), sum(self._sizes))
         inside = steps.numpy()
         np.concatenate([c.observations for c in candidates], out=inside[:, : self._sizes[0]], casting="unsafe")
@@ -337,7 +341,7 @@ def _flat(inputs: Tensor, mask: Tensor) -> tuple[Tensor, np.ndarray]:
     """The real steps (S, I) of padded candidates, and where candidates begin (S,)."""
     real = mask.bool()
     begins = torch.zeros_like(real)
-    begins[:, 0] = True
+    begins[:, 0] = True  # each candidate is a piece of its own, whatever came before it in its episode
     if real.all():
         return inputs.flatten(0, 1), begins.flatten().numpy()
     return inputs[real], begins[real].numpy()
@@ -366,12 +370,12 @@ def looking_back(
     rows = max(1, most // memory)
     for i in range(0, len(start), rows):
         part = slice(i, i + rows)
-        at = np.arange(length[part].max())
+        at = np.arange(length[part].max())  # (L,): columns of this chunk of rows
         steps = np.minimum(start[part, None] + at, len(inputs) - 1)  # what lies beyond a row's end is not taken
-        taken = (at < length[part, None]) & (at >= (length - new)[part, None])
+        taken = (at < length[part, None]) & (at >= (length - new)[part, None])  # within its row, and new there
         found.append(outputs(inputs[torch.from_numpy(steps)])[:, torch.from_numpy(taken)])
         places.append(steps[taken])
-    return torch.cat(found, 1)[:, torch.from_numpy(np.concatenate(places).argsort())]
+    return torch.cat(found, 1)[:, torch.from_numpy(np.concatenate(places).argsort())]  # back into the order of steps
 
 
 def windows(begins: np.ndarray, memory: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -382,8 +386,8 @@ def windows(begins: np.ndarray, memory: int) -> tuple[np.ndarray, np.ndarray, np
     at = np.arange(len(begins))
     heads = np.flatnonzero(begins | (at == 0))
     ends = np.append(heads[1:], len(begins))
-    age = at - np.repeat(heads, ends - heads)
-    late = np.flatnonzero(age >= memory)
+    age = at - np.repeat(heads, ends - heads)  # (S,): steps since the episode began
+    late = np.flatnonzero(age >= memory)  # each of these needs a row of its own, of the steps up to it
     length = np.concatenate([np.minimum(ends - heads, memory), np.full(len(late), memory)])
     new = np.concatenate([length[: len(heads)], np.ones(len(late), np.int64)])
     return np.concatenate([heads, late - memory + 1]), length, new

@@ -85,11 +85,12 @@ class TransformerReward:
     def __init__(self, settings: TransformerSettings, backbone: Backbone, rng: np.random.Generator) -> None:
         self._settings, self.backbone = settings, backbone
         generator = torch.Generator().manual_seed(draw_seed(rng))
+        # Over sqrt(d + 1), so that scores do not start further apart the wider the backbone is.
         heads = torch.randn(settings.members, backbone.width, generator=generator) / math.sqrt(backbone.width + 1)
         self._heads, self._bias = torch.nn.Parameter(heads), torch.nn.Parameter(torch.zeros(settings.members))
         self._shift, self._scale = torch.zeros(settings.members), torch.ones(settings.members)
         self._fits, self._temperature = 0, 1.0
-        backbone.model.requires_grad_(settings.train == "full")
+        backbone.model.requires_grad_(settings.train == "full")  # before adapters are added, which stay trainable
         if settings.train == "lora":
             from prefrl.reward_models.lora import add_adapters  # peft takes seconds to load
 
@@ -118,13 +119,14 @@ class TransformerReward:
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         features = stacked["features"] if "features" in stacked else self._features(stacked)
-        return linear(features, self._heads, self._bias).T
+        return linear(features, self._heads, self._bias).T  # (N, E) -> (E, N)
 
     @torch.no_grad()
     def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
         count = len(next(iter(stacked.values())))
         parts = [self.scores({k: x[i : i + CHUNK] for k, x in stacked.items()}) for i in range(0, count, CHUNK)]
         scores = torch.cat(parts, 1)
+        # The clamp: all scores may be equal, and rewards must stay finite.
         self._shift, self._scale = scores.mean(1), scores.std(1, correction=0).clamp(min=1e-6)
         self._fits, self._temperature = self._fits + 1, 1.0
         return scores
@@ -176,11 +178,12 @@ class TransformerReward:
         self._heads.copy_(head.weight)
         if head.bias is not None:
             self._bias.copy_(head.bias)
-        self._fits = 1
+        self._fits = 1  # it scores as it was fitted, so it counts as fitted
 
     @torch.no_grad()
     def mean_head(self) -> tuple[Tensor, float]:
         """The mean of the members' normalised scores is `features @ weight` (d,) plus a constant."""
+        # A mean of linear heads is one linear head, so an ensemble can be exported as a single model.
         weight = (self._heads / self._scale[:, None]).mean(0)
         return weight, float(((self._bias - self._shift) / self._scale).mean())
 
@@ -191,6 +194,7 @@ class TransformerReward:
     def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
         """(N, d) float32."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+            # Heads and scores in float32: bfloat16 near 1 moves in steps of 1/128, which would make ties.
             return self.backbone.states(stacked["tokens"], stacked["lengths"]).float()
 
     @torch.no_grad()
@@ -202,7 +206,7 @@ class TransformerReward:
     def _in_chunks(self, candidates: Sequence[Response]) -> Tensor:
         """(N, d) features, rows of like length together."""
         rows = self.backbone.rows(candidates)
-        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))  # like lengths share a chunk
         chunks = [order[i : i + CHUNK] for i in range(0, len(rows), CHUNK)]
         features = torch.cat([self._features(_padded([rows[i] for i in chunk])) for chunk in chunks])
         return features[torch.tensor(order).argsort()]

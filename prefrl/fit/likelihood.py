@@ -31,6 +31,7 @@ class Likelihood:
         self._error_rate, self._labelers = error_rate, terms.labelers
         self.tie = torch.zeros(members, requires_grad=self._ties != "half")
         self.first_threshold = torch.full((members, 1), -1.0, requires_grad=terms.scale > 0)
+        # Logarithms of the gaps, so that thresholds increase whatever values these take.
         self.gaps = torch.zeros(members, max(terms.scale - 2, 0), requires_grad=terms.scale > 2)
         start = math.log(START / (1 - START))
         self.errors = torch.full((members, len(terms.labelers)), start, requires_grad=reliability == "learned")
@@ -50,6 +51,7 @@ class Likelihood:
         """(E,) negative log-density of the learned error rates' prior, in judgements' worth of nats."""
         if not self.errors.requires_grad:
             return torch.zeros(len(self.errors))
+        # log(1 - e) + log e: a right answer and a wrong one.
         both = torch.nn.functional.logsigmoid(self.errors) + torch.nn.functional.logsigmoid(-self.errors)
         return -PRIOR * both.sum(1)
 
@@ -68,6 +70,7 @@ class Likelihood:
         tie: Floats | float = self._natural_tie().double().numpy()[:, None] if self.tie.requires_grad else 0.0
         outcomes = 2 if self._ties == "half" else 3
         blind = torch.tensor(self._error_rate * (outcomes - 1) / outcomes)
+        # (E, labelers) -> (J,): the labeler's rate at each of their judgements.
         rates = self.errors.detach().sigmoid() if self.errors.requires_grad else blind.expand_as(self.errors)
         return Answering(self._ties, tie, rates.mean(0)[terms.labeler].double().numpy())
 
@@ -82,7 +85,7 @@ class Likelihood:
         return torch.cat([self.first_threshold, self.first_threshold + self.gaps.exp().cumsum(1)], 1)
 
     def _choices(self, rows: Choices, scores: Tensor, labeler: Tensor) -> Tensor:
-        found = scores[:, rows.items]
+        found = scores[:, rows.items]  # (E, S, K)
         if not rows.pairs:
             found = found.masked_fill(~rows.present, -torch.inf)
         error = self._error(rows, labeler)
@@ -109,7 +112,7 @@ class Likelihood:
         if self._error_rate == 0.0:
             return 0.0
         outcomes = self._outcomes(rows)
-        blind: Tensor = self._error_rate * (outcomes - 1) / outcomes
+        blind: Tensor = self._error_rate * (outcomes - 1) / outcomes  # a blind answer is right once in n
         return blind[None]
 
 

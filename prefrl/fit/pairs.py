@@ -52,6 +52,7 @@ def batch(judged: Sequence[Judged[C]]) -> Batch[C]:
     for group, one in enumerate(judged):
         at = [index[c.id] for c in one.query.candidates]
         pairs = implied_pairs(one.judgement, len(at))
+        # K - 1 and not the number of pairs: a ranking of many candidates would otherwise outweigh all the rest.
         share = one.judgement.weight * (len(at) - 1) / max(len(pairs), 1)
         rows += [(at[i], at[j], preference, share, group) for i, j, preference in pairs]
     return _of_rows(tuple(candidates.values()), rows)
@@ -84,6 +85,7 @@ def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool]) -
     index = {c.id: i for i, c in enumerate(data.candidates)}
     waiting: dict[Hashable, list[tuple[int, Rating]]] = defaultdict(list)
     rows: list[tuple[int, int, float, float, int]] = []
+    # By id: the same judgements make the same pairs, in whatever order they came.
     for group in sorted(range(len(judged)), key=lambda j: judged[j].query.id):
         one, (candidate,) = judged[group].judgement, judged[group].query.candidates
         assert isinstance(one, Rating)  # nothing else has one candidate

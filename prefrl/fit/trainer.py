@@ -38,6 +38,7 @@ def fit(
     `unjudged` candidates are for pseudo-labels; open queries give some too. Raises `NothingToFit` where there is no
     judgement, or only ties.
     """
+    # Taken first: what people answer from here on is left to the next fit, and this one can be repeated.
     snapshot = store.sequence
     if fitting.pseudo_labels:
         waiting: list[C] = [c for query in store.open_queries() for c in query.candidates]
@@ -66,7 +67,7 @@ def fit_judged(
         _check_inputs(problem)
     try:
         epochs = optimise(problem, rng)
-    except FloatingPointError:
+    except FloatingPointError:  # name the candidate, where one is to blame
         _check_finite(all_scores(reward, problem.stacked), problem.candidates)
         _check_inputs(problem)
         raise
@@ -86,6 +87,7 @@ def _problem(
     """Everything that a fit needs, stacked once."""
     known: dict[str, C] = {c.id: c for one in judged for c in one.query.candidates}
     others: dict[str, C] = {c.id: c for c in unjudged if c.id not in known}
+    # The judged ones first, in the order of `known`: the terms below count them so.
     candidates: list[C] = list(known.values()) + (list(others.values()) if fitting.pseudo_labels else [])
     every = terms(judged, list(known), fitting.ties, fitting.rankings)
     out = torch.as_tensor(held_out)
@@ -108,6 +110,7 @@ def _finish(problem: Problem[C], data: Batch[C], out: np.ndarray, scores: Tensor
     """Measure a fit, and calibrate the model."""
     test, logits = data.subset(out), _logits(scores, data.subset(out))
     answering = problem.likelihood.answering(problem.every)
+    # On what was held out: on the training judgements a network is always surer than it may be.
     heat = temperature(logits, test.preference, answering.of(test.group), test.weight)
     problem.reward.calibrate(heat)
     metrics = {
@@ -129,6 +132,7 @@ def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.G
     count = len(part.labeler)
     if not bootstrap or members == 1:
         return torch.ones(members, count)
+    # Draws with replacement, as counts: every member sees the same minibatches, and weighs them in its own way.
     return torch.as_tensor(rng.multinomial(count, np.full(count, 1 / count), size=members), dtype=torch.float32)
 
 

@@ -165,8 +165,10 @@ class ControlLearner:
         for number, steps in enumerate(self._rollout_lengths()):
             rollout, observations = collect(envs, observations, steps, lambda o: self.policy.act(o, rng))
             self._steps = self._steps.add(learn=rollout.ends.size)
+            # Only before the first rollout is the reward one that the critic has not seen.
             metrics.append(self._learn(rollout, scorer, rng, critic_first=number == 0))
             rollouts.append(rollout)
+        # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._recent, self._rounds = joined(rollouts), self._rounds + 1
         return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
 
@@ -196,6 +198,7 @@ class ControlLearner:
 
     def _rollout_lengths(self) -> list[int]:
         each = self._settings.steps_per_round // self._settings.environments
+        # Equal parts: a short last rollout would whiten its advantages over a handful of steps.
         parts = max(1, round(each / self._settings.rollout_steps))
         return [len(part) for part in np.array_split(np.arange(each), parts)]
 
@@ -211,15 +214,17 @@ class ControlLearner:
             update(
                 self.policy, self._optimizer, batch, self._minibatches(len(batch), settings.critic_epochs, rng), alone
             )
-            batch, explained = self._batch(rollout, rewards)
+            batch, explained = self._batch(rollout, rewards)  # advantages by the critic that knows the new reward
         minibatches = self._minibatches(len(batch), settings.epochs, rng)
         steps = update(self.policy, self._optimizer, batch, minibatches, objective)
+        # Not before the update: actions were drawn under the old statistics, and the ratio must start at 1.
         self.policy.observe(rollout.observations)
         if settings.target_kl is not None:
             last = steps[-len(steps) // settings.epochs :]  # the last epoch's
             kl = float(np.mean([step["kl_old"] for step in last]))
             steer(self._optimizer, kl, settings.target_kl, settings.learning_rate)
         means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
+        # The first step's, where nothing has changed yet: anything but rounding is a bug.
         return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
 
     @torch.no_grad()
@@ -227,32 +232,39 @@ class ControlLearner:
         """What the update needs, B = n x T sequences of one step, and how much of the returns the critic explains."""
         settings, policy = self._settings, self.policy
         observations = torch.from_numpy(policy.normalise(rollout.observations))
-        values = policy.values_of(observations)
+        values = policy.values_of(observations)  # (n, T)
         ends = torch.from_numpy(rollout.ends)
         scaled = torch.from_numpy(rewards).float() * _scale(settings.discount)
         advantages = gae(scaled, values, self._next_values(rollout, values), ends, settings.discount, settings.trace)
         returns = advantages + values
+        # The clamp: returns that do not vary leave nothing to explain.
         explained = 1.0 - float(advantages.var() / returns.var().clamp(min=1e-12))
+        # Whitened only now: the critic's targets above are in the units of the reward.
         white = masked_whiten(advantages, torch.ones_like(advantages))
+        # (n, T, .) -> (B, .), in the order that view(-1, 1) gives the other columns below.
         decisions = Decisions(observations.flatten(0, 1), torch.from_numpy(rollout.choices).flatten(0, 1))
+        # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
         logp, _ = policy.log_prob(decisions)
         return Batch(decisions, logp, white.view(-1, 1), returns.view(-1, 1)), explained
 
     def _next_values(self, rollout: Rollout, values: Tensor) -> Tensor:
         """(n, T): the value of what each step led to."""
         unseen = rollout.ends.copy()
-        unseen[:, -1] = True
+        unseen[:, -1] = True  # what follows a row's last step is in the next rollout
         final = torch.from_numpy(self.policy.normalise(rollout.final_observations[unseen]))
+        # After an end the next column belongs to another episode, so the final observation is valued by itself. The
+        # column that fills up the end of each row is among those replaced.
         following = torch.cat([values[:, 1:], values[:, :1]], 1)
         following[torch.from_numpy(unseen)] = self.policy.values_of(final)
-        return following * ~torch.from_numpy(rollout.terminated)
+        return following * ~torch.from_numpy(rollout.terminated)  # a time limit still has a future
 
     def _minibatches(self, size: int, epochs: int, rng: np.random.Generator) -> list[Tensor]:
         parts = max(1, round(size / self._settings.minibatch))
         orders = [torch.from_numpy(rng.permutation(size)) for _ in range(epochs)]
+        # tensor_split leaves no small remainder, whose gradient would be mostly noise.
         return [rows for order in orders for rows in order.tensor_split(parts)]
 
 
 def _scale(discount: float) -> float:
     """Returns of white noise of std 1 have a std of 1 / sqrt(1 - discount^2): this undoes it."""
-    return math.sqrt(1.0 - discount**2) or 1.0
+    return math.sqrt(1.0 - discount**2) or 1.0  # undiscounted returns have no such limit: left as they are

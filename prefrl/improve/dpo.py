@@ -90,6 +90,7 @@ class DPO:
         if not len(data):
             raise ValueError("dpo learns from judged pairs; the store holds none: raise loop.labels, or import some")
         rows = Responses.of(data.candidates, policy.task.tokenizer)
+        # (N,), once: the starting policy does not change. Padding is 0, so the sums are over the responses' own tokens.
         reference, seen = policy.start_logp(rows).sum(1), []
         for _ in range(self._settings.epochs):
             for at in np.array_split(rng.permutation(len(data)), -(-len(data) // self._settings.minibatch)):
@@ -101,13 +102,16 @@ class DPO:
         self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers
     ) -> Iterator[tuple[Tensor, dict[str, Tensor]]]:
         """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
+        # `chunk` counts rows, and a pair has two.
         for some in np.array_split(at, -(-2 * len(at) // self._settings.chunk)):
+            # Of the whole minibatch's weight, so that the losses of the parts add up to its mean.
             share = torch.from_numpy(data.weight[some] / data.weight[at].sum())
+            # (m, 2) -> (2 m,), the two of a pair side by side; view(-1, 2) takes them apart again.
             pairs, preference = torch.from_numpy(data.edges[some]).flatten(), torch.from_numpy(data.preference[some])
             gains = (self._writer.policy.log_prob(rows.rows(pairs))[0].sum(1) - reference[pairs]).view(-1, 2)
             margin = self._settings.beta * (gains[:, 0] - gains[:, 1])
             loss = (dpo_loss(margin, preference, self._settings.label_smoothing) * share).sum()
-            signed = (margin * (2 * preference - 1).sign()).detach()
+            signed = (margin * (2 * preference - 1).sign()).detach()  # 0 for a tie, which makes it half right below
             yield loss, {"accuracy": (share * (signed.sign() + 1) / 2).sum(), "margin": (share * signed).sum()}
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:

@@ -80,7 +80,7 @@ class Batch(Generic[I]):
         def cut(steps: Tensor | None) -> Tensor | None:
             return None if steps is None else steps[at, :width]
 
-        advantages, logp = self.advantages[at, :width], self.logp[at, :width]
+        advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
         return Batch(inputs, logp, advantages, cut(self.returns), cut(self.values), cut(self.reference))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
@@ -89,6 +89,7 @@ class Batch(Generic[I]):
         if size is None:
             yield self
             return
+        # Stable: rows of equal length keep their order, so that the same seed rounds in the same way.
         for at in self.inputs.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
             yield self.rows(at)
 
@@ -124,6 +125,7 @@ def step(
     (from the policy that drew the batch, estimator k3) and ratio_error (the largest |pi / pi_old - 1|).
     """
     mask = batch.inputs.mask
+    # Counts of the whole minibatch: a mean of the parts' means would give short parts too much weight.
     rows, steps = len(mask), int(mask.sum())
     parts = (_losses(policy, some, objective, rows, steps) for some in batch.parts(part))
     return descend(policy.parameters(), optimizer, parts, objective.max_grad_norm)
@@ -143,8 +145,10 @@ def descend(
     optimizer.zero_grad()
     measured = []
     for loss, seen in parts:
+        # One part's graph at a time is in memory; gradients add up in the parameters.
         loss.backward()  # type: ignore[no-untyped-call]
         names = ("loss", *seen)
+        # Detached, or the list would keep every part's graph alive.
         measured.append(torch.stack([loss.detach(), *seen.values()]))
     found = torch.stack(measured)
     metrics = dict(zip(names, found.sum(0).tolist(), strict=True))
@@ -191,6 +195,8 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
         gain = clipped_surrogate(ratios, batch.advantages, objective.clip)
     if objective.beta:
         assert batch.reference is not None
+        # Token by token: not the gradient of the whole sequence's KL, for it does not credit a token with what its
+        # choice does to the KL of later ones. The KL in the reward does.
         gain = gain + objective.beta * kl_k2(logp, batch.reference)
     return gain
 
@@ -198,15 +204,17 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
 def _value(policy: Policy[I], batch: Batch[I], objective: Objective) -> Tensor:
     """The critic's loss, summed over steps."""
     assert batch.returns is not None
+    # Old values are read by the value clip alone.
     values, old = policy.values(batch.inputs), batch.returns if batch.values is None else batch.values
     return masked_sum(value_loss(values, old, batch.returns, objective.value_clip), batch.inputs.mask)
 
 
 def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Tensor]:
     """How far the policy has gone from the one that drew the batch, from log-ratios that are 0 on padding."""
-    apart = ratios.expm1().abs()
+    apart = ratios.expm1().abs()  # expm1 keeps the digits of ratios near 1
     return {
         "clipped": (apart > (objective.clip or math.inf)).sum() / steps,
+        # The old policy drew the samples, so this is KL(old || new): k3's d is log old - log new.
         "kl_old": kl_k3(-ratios, torch.zeros(())).sum() / steps,
         "ratio_error": apart.max(),
     }

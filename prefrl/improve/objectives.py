@@ -23,7 +23,7 @@ MAX_LOG_RATIO = 20.0
 
 def masked_sum(x: Tensor, mask: Tensor) -> Tensor:
     """The sum over real steps. Padding may hold anything, NaN included."""
-    return torch.where(mask.bool(), x, 0.0).sum()
+    return torch.where(mask.bool(), x, 0.0).sum()  # not x * mask: NaN times 0 is NaN
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
@@ -35,6 +35,7 @@ def masked_whiten(x: Tensor, mask: Tensor, eps: float = 1e-8) -> Tensor:
     """Shift and scale to mean 0 and unit (biased) variance over real steps; padding becomes 0."""
     mean = masked_mean(x, mask)
     variance = masked_mean((x - mean) ** 2, mask)
+    # eps under the root: where all steps are alike they become 0, not NaN.
     return torch.where(mask.bool(), (x - mean) * torch.rsqrt(variance + eps), 0.0)
 
 
@@ -51,6 +52,7 @@ def reduce(x: Tensor, mask: Tensor, how: Reduction, rows: int, steps: int) -> Te
     if how == "token":
         return masked_sum(x, mask) / steps
     if how == "sequence":
+        # The clamp: a row without a real step has no mean, and adds 0.
         return (torch.where(mask.bool(), x, 0.0).sum(1) / mask.sum(1).clamp(min=1)).sum() / rows
     return masked_sum(x, mask) / rows
 
@@ -63,7 +65,7 @@ def step_rewards(scores: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tenso
 
     Ziegler et al. 2019, equation 2, with the KL written per token (estimator k1).
     """
-    last = (mask.sum(1).long() - 1).clamp(min=0)
+    last = (mask.sum(1).long() - 1).clamp(min=0)  # (B,); an empty row points at 0, and gets no score below
     rewards = torch.where(mask.bool(), -beta * kl, 0.0)
     return rewards.scatter_add(1, last[:, None], (scores * mask.any(1))[:, None].to(rewards.dtype))
 
@@ -75,8 +77,9 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
     after a truncation. `ends` is 1 where an episode stops, for either reason. Padding must be 0 in every argument.
     """
     delta = rewards + discount * next_values - values
+    # Any end cuts the trace: what comes after a time limit is another episode, though its value still bootstraps.
     keep = discount * trace * (1.0 - ends.to(delta.dtype))
-    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)
+    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)  # (B,), (B, L)
     for t in range(delta.shape[1] - 1, -1, -1):
         running = delta[:, t] + keep[:, t] * running
         out[:, t] = running
@@ -88,6 +91,7 @@ def leave_one_out(scores: Tensor) -> Tensor:
     count = scores.shape[1]
     if count < 2:
         raise ValueError(f"leave-one-out needs at least 2 responses a prompt, got {count}")
+    # x_i - (sum - x_i) / (K - 1) = (x_i - mean) K / (K - 1): no sum over the others for each i.
     return (scores - scores.mean(1, keepdim=True)) * (count / (count - 1))
 
 
@@ -99,6 +103,7 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
     if scores.shape[1] < 2:
         raise ValueError(f"group normalisation needs at least 2 responses a prompt, got {scores.shape[1]}")
     centred = scores - scores.mean(1, keepdim=True)
+    # The mean of equal numbers can differ from them in its last bit, which a std of 0 plus eps would blow up.
     equal = (scores == scores[:, :1]).all(1, keepdim=True)
     return torch.where(equal, 0.0, centred / (scores.std(1, keepdim=True) + eps))
 
@@ -108,6 +113,7 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
 
 def log_ratio(logp: Tensor, old_logp: Tensor, mask: Tensor) -> Tensor:
     """log pi(a) - log pi_old(a), clamped; 0 on padding, whatever it holds."""
+    # Padding goes first: a clamp lets NaN through.
     return torch.where(mask.bool(), logp - old_logp, 0.0).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
 
 
@@ -141,6 +147,7 @@ def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
     of them that are taken to be wrong (cDPO, Mitchell 2023).
     """
     right = preference * (1 - smoothing) + (1 - preference) * smoothing
+    # log(1 - s(h)) as logsigmoid(-h): the other way it is log 0 for a large margin.
     return -(right * logsigmoid(margins) + (1 - right) * logsigmoid(-margins))
 
 
@@ -176,5 +183,6 @@ class AdaptiveKL:
 
     def update(self, kl: float, sequences: int) -> AdaptiveKL:
         """`kl`: the mean KL per sequence (not per token) over the last `sequences`."""
+        # The paper's clip: one batch far off the target moves beta no further than one 20 % off.
         error = min(max(kl / self.target - 1.0, -0.2), 0.2)
         return replace(self, beta=self.beta * (1.0 + error * sequences / self.horizon))

@@ -62,7 +62,7 @@ class SB3Settings(Settings):
         if self.algorithm == "PPO":
             options["n_steps"] = each = min(self.at_once, options.get("batch_size", BATCH))
         else:
-            options["learning_starts"] = 0
+            options["learning_starts"] = 0  # else a trial run would end before the first gradient step
             each = min(self.steps_per_round // self.environments, self.at_once * max(1, BATCH // self.at_once))
         steps = each * self.environments
         return self.model_copy(update={"options": options, "steps_per_round": steps, "evaluation_episodes": 1})
@@ -134,14 +134,16 @@ class SB3:
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
         self._learned.learned, before = step_rewards(reward), self._env.steps
+        # Before learning: the buffer holds what the reward model said before its last fit.
         if isinstance(self.model, SAC):
             relabel(self.model.replay_buffer, step_rewards(reward))
         self._env.start(rng)
         self.model._last_obs = None  # makes learn() reset the environments
         with seeded(rng):
-            self.model.action_space.seed(draw_seed(rng))
+            self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
             self.model.learn(self._settings.steps_per_round, reset_num_timesteps=False, log_interval=None)
         self._steps = self._steps.add(learn=self._env.steps - before)
+        # Taken before the second start, which forgets it and so frees the memory.
         self._recent, self._rounds = self._env.rollout(), self._rounds + 1
         self._env.start(rng)
         values = self.model.logger.name_to_value
@@ -193,6 +195,7 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
     """stable-baselines3 draws from the global generators: seed them from `rng`, and put them back at the end."""
     python, numpy_ = random.getstate(), np.random.get_state()
     try:
+        # CPU only: by default the state of every GPU would be saved as well.
         with torch.random.fork_rng(devices=[]):
             seed = draw_seed(rng)
             random.seed(seed)
@@ -212,7 +215,7 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
         return ALGORITHMS[settings.algorithm](
             "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device="cpu", verbose=0, **options
         )
-    except TypeError as error:
+    except TypeError as error:  # an option that its constructor does not have
         raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error
 
 
@@ -235,6 +238,7 @@ def _attribute(model: Any, dotted: str) -> Any:
 
 def _replay_state(buffer: ReplayBuffer) -> State:
     size = buffer.size()
+    # What is filled, not what is allocated: a buffer may have room for a million steps.
     return {name: getattr(buffer, name)[:size].copy() for name in REPLAY} | {"pos": buffer.pos, "full": buffer.full}
 
 

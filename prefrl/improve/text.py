@@ -170,17 +170,19 @@ class TextLearner:
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
         settings = self._settings
-        raw = torch.as_tensor(reward.score(drawn.candidates(self._task.tokenizer)), dtype=torch.float32)
+        raw = torch.as_tensor(reward.score(drawn.candidates(self._task.tokenizer)), dtype=torch.float32)  # (B,)
         scores = self._finite("reward", raw - settings.missing_end_penalty * ~drawn.ended)
         reference = self._reference_logp(drawn)
-        kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)
+        kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
+        # (B,): one return a response, so the KL is in it before the baseline is taken off.
         returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
-        groups = returns.view(-1, settings.responses)
-        advantages = advantages_of(groups, settings.advantage).view(-1, 1)
+        groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
+        advantages = advantages_of(groups, settings.advantage).view(-1, 1)  # (B, 1): the same for all tokens
         batch = Batch(drawn, drawn.logp, advantages, reference=reference)
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.chunk)
+        # Per response, as the target is: a mean per token would be smaller by the length.
         sequence_kl = float(kl.sum(1).mean())
         if settings.kl_target is not None:
             self._kl = self._kl.update(sequence_kl, len(batch))
@@ -213,7 +215,7 @@ class TextLearner:
 
     def _minibatches(self, size: int, rng: np.random.Generator) -> list[Tensor]:
         order = torch.Generator().manual_seed(draw_seed(rng))
-        each = -(-size // self._settings.minibatches)
+        each = -(-size // self._settings.minibatches)  # rounded up, so that there are no more than asked for
         orders = [torch.randperm(size, generator=order) for _ in range(self._settings.epochs)]
         return [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
 

@@ -40,11 +40,11 @@ class Writer:
         return evaluated
 
     def state(self) -> State:
-        optimizer = copy.deepcopy(self.optimizer.state_dict())
+        optimizer = copy.deepcopy(self.optimizer.state_dict())  # its tensors are live, and the next step changes them
         return {"model": self.policy.state(), "optimizer": optimizer, "steps": list(self.steps)}
 
     def load(self, state: State) -> None:
         """Raises ValueError where names or shapes differ."""
         self.policy.load(state["model"])
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # which may keep the very tensors it is given
         self.steps = Steps(*state["steps"])

@@ -88,6 +88,7 @@ class CloningSettings(Settings):
     def digest(self, source: str) -> str:
         """Of the settings, the writer's source, and the versions that decide the weights."""
         versions = [RECIPE, torch.__version__, transformers.__version__, tokenizers.__version__]
+        # Where a model is kept does not change it.
         everything = [self.model_dump(mode="json", exclude={"cache"}), source, versions]
         return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -100,7 +101,7 @@ def _make(settings: CloningSettings, write: Writer, folder: Path) -> None:
 
 
 def _load(folder: Path) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
-    verify(folder)
+    verify(folder)  # the name says what went in, not whether all of it is still there
     with _quiet():
         model = LlamaForCausalLM.from_pretrained(
             folder, dtype=torch.float32, local_files_only=True, use_safetensors=True
@@ -127,6 +128,7 @@ def clone(settings: CloningSettings, write: Writer) -> tuple[LlamaForCausalLM, P
     pairs = [write(rng) for _ in range(settings.reviews)]
     tokenizer = make_tokenizer([prompt + rest for prompt, rest in pairs], settings.vocabulary)
     rows = [tokenizer.encode(prompt) + encode_rest(tokenizer, rest) for prompt, rest in pairs]
+    # transformers initialises from torch's global generator, which is put back for whoever else draws from it.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(draw_seed(rng))
         model = make_model(settings, tokenizer)
@@ -157,6 +159,7 @@ def _one_thread() -> Iterator[None]:
 def make_tokenizer(texts: list[str], vocabulary: int) -> PreTrainedTokenizerFast:
     """A byte-level BPE with distinct tokens for padding, begin and end; encoding adds the begin token, once."""
     inner = Tokenizer(models.BPE())
+    # No space in front: a response is encoded apart from its prompt, and must join it as it was written.
     inner.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     inner.decoder = decoders.ByteLevel()
     inner.train_from_iterator(
@@ -164,11 +167,12 @@ def make_tokenizer(texts: list[str], vocabulary: int) -> PreTrainedTokenizerFast
         trainers.BpeTrainer(
             vocab_size=vocabulary,
             special_tokens=[PAD, BOS, EOS],
-            initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+            initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),  # all bytes, so that any text can be encoded
             show_progress=False,
         ),
     )
     inner.post_processor = processors.TemplateProcessing(f"{BOS} $A", special_tokens=[(BOS, inner.token_to_id(BOS))])
+    # Cleaning up would drop spaces before punctuation, and a decoded response would not be what was sampled.
     return PreTrainedTokenizerFast(  # type: ignore[no-untyped-call]
         tokenizer_object=inner, pad_token=PAD, bos_token=BOS, eos_token=EOS, clean_up_tokenization_spaces=False
     )
@@ -184,7 +188,7 @@ def make_model(settings: CloningSettings, tokenizer: PreTrainedTokenizerFast) ->
     config = LlamaConfig(
         vocab_size=len(tokenizer),
         hidden_size=settings.width,
-        intermediate_size=max(32, settings.width * 8 // 3 // 32 * 32),
+        intermediate_size=max(32, settings.width * 8 // 3 // 32 * 32),  # 8/3 of the width, as in Llama
         num_hidden_layers=settings.layers,
         num_attention_heads=settings.heads,
         max_position_embeddings=512,
@@ -200,7 +204,7 @@ def _batches(rows: list[list[int]], size: int, rng: np.random.Generator) -> list
     """Right-padded batches of rows of like length, in random order; padding is `IGNORED`."""
     rows = sorted(rows, key=len)
     found = []
-    for start in range(0, len(rows) - size + 1, size):
+    for start in range(0, len(rows) - size + 1, size):  # the longest rows that fill no batch are left out
         some = rows[start : start + size]
         found.append(torch.tensor([row + [IGNORED] * (len(some[-1]) - len(row)) for row in some]))
     return [found[i] for i in rng.permutation(len(found))]
@@ -208,11 +212,12 @@ def _batches(rows: list[list[int]], size: int, rng: np.random.Generator) -> list
 
 def _rate(step: int, steps: int) -> float:
     warm = max(1, steps // 20)
-    return min((step + 1) / warm, 0.5 + 0.5 * math.cos(math.pi * step / steps))
+    return min((step + 1) / warm, 0.5 + 0.5 * math.cos(math.pi * step / steps))  # step + 1: the first step moves too
 
 
 def _step(model: LlamaForCausalLM, optimizer: torch.optim.Optimizer, batch: Tensor) -> float:
     """One gradient step on a batch; its loss in nats a token. Padding is on the right, so no mask is needed."""
+    # IGNORED is no token: id 0 stands in for it where it is read, and as a target it does not count.
     logits = model(input_ids=batch[:, :-1].clamp(min=0), use_cache=False).logits
     loss = torch.nn.functional.cross_entropy(logits.flatten(0, 1), batch[:, 1:].flatten(), ignore_index=IGNORED)
     optimizer.zero_grad()

@@ -64,9 +64,10 @@ class CacheDecoder:
         cache.batch_repeat_interleave(samples)
         self._model, self._cache = model, cache
         self._mask = mask.repeat_interleave(samples, 0)
-        self._positions = self._mask.sum(1, keepdim=True)
+        self._positions = self._mask.sum(1, keepdim=True)  # (B, 1): where the first new token is, padding not counted
 
     def step(self, tokens: Tensor) -> Tensor:
+        # For rows that have ended too: nobody reads what they go on to say.
         self._mask = torch.cat([self._mask, torch.ones_like(self._mask[:, :1])], 1)
         out = self._model(
             input_ids=tokens[:, None],
@@ -76,7 +77,7 @@ class CacheDecoder:
             use_cache=True,
         )
         self._positions = self._positions + 1
-        logits: Tensor = out.logits[:, -1]
+        logits: Tensor = out.logits[:, -1]  # (B, 1, V) -> (B, V)
         return logits
 
     def keep(self, rows: Tensor) -> None:
@@ -107,6 +108,7 @@ def pad_left(prompts: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     if not prompts or not all(prompts):
         raise ValueError("generation wants at least one prompt, and at least one token in each (the begin token)")
     width = max(map(len, prompts))
+    # On the left, so that the last column is the last token of every prompt.
     ids = torch.tensor([[0] * (width - len(p)) + list(p) for p in prompts])
     mask = torch.tensor([[0] * (width - len(p)) + [1] * len(p) for p in prompts])
     return ids, mask
@@ -119,6 +121,7 @@ def _prefill(
     ids, mask = pad_left(prompts)
     ids, mask = ids.to(model.device), mask.to(model.device)
     cache = DynamicCache(config=model.config)
+    # Padding is not counted: a model with absolute positions would otherwise see every prompt shifted.
     positions = (mask.cumsum(1) - 1).clamp(min=0)
     out = model(
         input_ids=ids,
@@ -128,7 +131,7 @@ def _prefill(
         use_cache=True,
         logits_to_keep=1,
     )
-    logits = out.logits[:, -1].repeat_interleave(sampling.samples, 0)
+    logits = out.logits[:, -1].repeat_interleave(sampling.samples, 0)  # (P, V) -> (B, V)
     if fast and LlamaDecoder.fits(model):
         return LlamaDecoder(model, cache, mask, sampling.samples, sampling.max_tokens), logits
     return CacheDecoder(model, cache, mask, sampling.samples), logits
@@ -146,8 +149,9 @@ def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: tor
     live = torch.arange(rows, device=logits.device)
     for t in range(length):
         drawn, drawn_logp = draw(logits, uniform[live, t], sampling.temperature)
-        going = ~ended[live]
+        going = ~ended[live]  # ended rows that are still in the batch draw on, into padding
         tokens[live, t], logp[live, t], mask[live, t] = drawn * going, drawn_logp * going, going
+        # Only after the mask was written: an end token is a real one.
         ended[live] |= torch.isin(drawn, ends)
         going = ~ended[live]
         if t + 1 == length or not going.any():
@@ -155,13 +159,14 @@ def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: tor
         if going.float().mean() <= KEEP_SHARE:
             kept = going.nonzero()[:, 0]
             decoder.keep(kept)
-            live, drawn = live[kept], drawn[kept]
+            live, drawn = live[kept], drawn[kept]  # `kept` counts within the batch, `live` within the result
         logits = decoder.step(drawn)
     return Generation(tokens, mask, logp, ended)
 
 
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
     """(B, V) logits and (B,) numbers in [0, 1) -> (B,) tokens, by inverting the CDF; (B,) their log-probabilities."""
+    # In float32: bfloat16 would lose two or three digits of every log-probability.
     logp = (logits.float() / temperature).log_softmax(-1)
     cdf = logp.exp().cumsum(-1)
     total = cdf[:, -1:]

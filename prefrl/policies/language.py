@@ -65,13 +65,14 @@ class Responses:
         """Responses that were sampled as they were; those that came as text alone are encoded, an end token added."""
         ends, pairs = int(tokenizer.eos_token_id), []
         for one in candidates:
+            # Text that is encoded anew can merge across the border, into tokens that nobody sampled.
             prompt = one.prompt_tokens or tuple(tokenizer.encode(one.prompt))
             tokens = one.tokens or (*tokenizer.encode(one.text, add_special_tokens=False), ends)
             pairs.append((prompt, tokens))
         lengths = torch.tensor([len(tokens) for _, tokens in pairs])
         mask = torch.arange(int(lengths.max())) < lengths[:, None]
         padded = torch.zeros(mask.shape, dtype=torch.int64)
-        padded[mask] = torch.tensor([token for _, tokens in pairs for token in tokens])
+        padded[mask] = torch.tensor([token for _, tokens in pairs for token in tokens])  # a mask is filled row by row
         ended = torch.tensor([tokens[-1] == ends for _, tokens in pairs])
         texts = tuple(one.prompt for one in candidates)
         return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, torch.zeros(mask.shape), ended)
@@ -96,7 +97,7 @@ class LanguagePolicy:
 
     def __init__(self, task: TextTask, temperature: float, part: int) -> None:
         self.task, self.temperature, self.part = task, temperature, part
-        self.model, self.start = task.model(), task.model().requires_grad_(False)
+        self.model, self.start = task.model(), task.model().requires_grad_(False)  # two copies of the weights
         check_head(self.model)
 
     def parameters(self) -> list[torch.nn.Parameter]:
@@ -117,6 +118,7 @@ class LanguagePolicy:
         ends, temperature = (int(tokenizer.eos_token_id),), self.temperature if temperature is None else temperature
         sampling = Sampling(samples, self.task.response_tokens, ends, temperature)
         drawn = generate(self.model, encoded, sampling, torch.Generator().manual_seed(draw_seed(rng)))
+        # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
         return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
@@ -133,6 +135,7 @@ class LanguagePolicy:
         return [replace(r, gold=gold[i : i + 1]) for i, r in enumerate(found)]
 
     def state(self) -> State:
+        # Tied weights have one name here, and are saved once.
         return {name: p.detach().clone() for name, p in self.model.named_parameters()}
 
     @torch.no_grad()
@@ -142,7 +145,7 @@ class LanguagePolicy:
             found = state.get(name)
             if found is None or found.shape != parameter.shape:
                 raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
-            parameter.copy_(found)
+            parameter.copy_(found)  # in place: the optimiser holds these very tensors
 
 
 def response_logp(model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
@@ -152,17 +155,18 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
     The head runs on the real tokens of the responses only.
     """
     lengths = torch.tensor([len(p) for p in responses.prompt_tokens])
-    rows, steps = responses.mask.nonzero(as_tuple=True)
-    places = lengths[rows] + steps
-    ids = torch.zeros(len(responses), int(places.max()) + 1, dtype=torch.int64)
+    rows, steps = responses.mask.nonzero(as_tuple=True)  # (n,), (n,): the n real tokens, row by row
+    places = lengths[rows] + steps  # (n,): the column of each, after its prompt
+    ids = torch.zeros(len(responses), int(places.max()) + 1, dtype=torch.int64)  # padded with 0, which is a valid id
     for row, prompt in zip(ids, responses.prompt_tokens, strict=True):
         row[: len(prompt)] = torch.tensor(prompt)
     chosen = responses.tokens[rows, steps]
     ids[rows, places] = chosen
     hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
-    logits = head_logits(model, hidden[rows, places - 1])
+    logits = head_logits(model, hidden[rows, places - 1])  # (n, V): the state before a token predicts it
+    # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
     found = -torch.nn.functional.cross_entropy(logits.float() / temperature, chosen, reduction="none")
-    return torch.zeros(responses.mask.shape).masked_scatter(responses.mask, found)
+    return torch.zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
 
 
 @torch.no_grad()
@@ -170,7 +174,7 @@ def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, p
     """`response_logp` without gradients, a part of the rows at a time."""
     found = torch.zeros(responses.mask.shape)
     for at, rows in responses.parts(part):
-        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)
+        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)  # a part is cut to its longest row
     return found
 
 

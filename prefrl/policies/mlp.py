@@ -36,6 +36,7 @@ class ActionSpace:
         low, high = (np.asarray(b, np.float32) for b in task.action_bounds)
         bounded = np.isfinite(low) & np.isfinite(high)
         middle = np.where(bounded, (low + high) / 2, 0).astype(np.float32)
+        # What has no bounds has no scale either: there the choice is the action.
         half = np.where(bounded, (high - low) / 2, 1).astype(np.float32)
         return cls(task.action_size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
 
@@ -47,6 +48,7 @@ class ActionSpace:
         """(..., A) -> (..., A): what the environment is given."""
         if self.middle is None or self.half is None or self.clip is None:
             return choices
+        # The log-probability is that of the choice before the clip, which is part of the world like the simulator.
         return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
 
 
@@ -95,6 +97,7 @@ class MLPPolicy:
     def normalise(self, observations: Floats) -> Floats:
         """(..., O) -> (..., O) float32, by the statistics so far."""
         scaled = (observations - self._mean32) * self._scale32
+        # A state far outside of what was seen would otherwise saturate the first layer.
         return np.clip(scaled, -CLIP, CLIP, out=scaled)
 
     @property
@@ -103,13 +106,14 @@ class MLPPolicy:
 
     @property
     def _scale32(self) -> Floats:
-        return (1.0 / np.sqrt(self.variance + 1e-8)).astype(np.float32)
+        return (1.0 / np.sqrt(self.variance + 1e-8)).astype(np.float32)  # eps: some inputs never change
 
     def observe(self, observations: Floats) -> None:
         """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979).
 
         Never between acting and learning: the probability ratio would not start at 1.
         """
+        # In float64: float32 sums lose small changes over many rounds.
         new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
         total = self.count + len(new)
         delta = new.mean(0) - self.mean
@@ -121,6 +125,7 @@ class MLPPolicy:
         """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None."""
         outputs = self._actor_numpy(self.normalise(observations))
         if self.space.discrete:
+            # The largest of logits plus Gumbel noise is a draw from their softmax.
             noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
             choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
             return choices, choices
@@ -133,11 +138,12 @@ class MLPPolicy:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
         outputs = forward(self.actor, inputs.observations)
         if self.space.discrete:
-            logp = (outputs.log_softmax(-1) * inputs.choices).sum(-1, keepdim=True)
+            logp = (outputs.log_softmax(-1) * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
             return logp, categorical_entropy(outputs)[:, None]
         scaled = (inputs.choices - outputs) * (-self.log_std).exp()
         constant = self.log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
         entropy = constant + 0.5 * self.space.size
+        # A Gaussian's entropy hangs on its std alone, which is the same in every state.
         return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(len(outputs), 1)
 
     def values(self, inputs: Decisions) -> Tensor:
@@ -158,7 +164,7 @@ class MLPPolicy:
             if state["parameters"][name].shape != parameter.shape:
                 found, expected = tuple(state["parameters"][name].shape), tuple(parameter.shape)
                 raise ValueError(f"policy: {name} has shape {found}, expected {expected}: other settings or task")
-            parameter.data.copy_(state["parameters"][name])
+            parameter.data.copy_(state["parameters"][name])  # in place: the optimiser holds these very tensors
         self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
 
     def _named(self) -> list[tuple[str, torch.nn.Parameter]]:
@@ -166,7 +172,7 @@ class MLPPolicy:
         return nets + [(f"critic_{i}", p) for i, p in enumerate(self.critic)] + [("log_std", self.log_std)]
 
     def _actor_numpy(self, x: Floats) -> Floats:
-        arrays = [p.detach().numpy() for p in self.actor]
+        arrays = [p.detach().numpy() for p in self.actor]  # views, which follow the optimiser's steps
         for i in range(0, len(arrays) - 2, 2):
             x = np.tanh(x @ arrays[i].T + arrays[i + 1])
         out: Floats = x @ arrays[-2].T + arrays[-1]
@@ -189,6 +195,7 @@ def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:
 def _mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> list[torch.nn.Parameter]:
     net = []
     for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        # 0.01 for the actor: it starts with about the same distribution in every state.
         gain = last_gain if i == len(sizes) - 2 else math.sqrt(2)
         weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, generator)
         net += [torch.nn.Parameter(weight), torch.nn.Parameter(torch.zeros(fan_out))]

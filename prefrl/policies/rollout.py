@@ -46,7 +46,7 @@ class Rollout:
     @property
     def begins(self) -> np.ndarray:
         """(n, T) bool: the first step of an episode, or of the row."""
-        begins: np.ndarray = np.roll(self.ends, 1, 1)
+        begins: np.ndarray = np.roll(self.ends, 1, 1)  # wraps the row's last end to its start, which is set below
         begins[:, 0] = True
         return begins
 
@@ -68,16 +68,18 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
     """
     rows = []
     for t in range(steps):
-        states = envs.states()
+        states = envs.states()  # before the step: a segment shows the state in which each action was taken
         choices, actions = act(observations)
         step = envs.step(actions)
+        # A copy: some simulators go on writing into the array that they gave out.
         rows.append((observations, choices, actions, step, None if states is None else states.copy()))
+        # The final ones: a reset in the same step would hide a simulation that went to infinity.
         if not np.isfinite(step.final_observations).all():
             raise FloatingPointError(_not_finite(step.final_observations, actions, t))
         observations = step.observations
     steps_ = [row[3] for row in rows]
     rollout = Rollout(
-        observations=np.stack([row[0] for row in rows], 1),
+        observations=np.stack([row[0] for row in rows], 1),  # T x (n, O) -> (n, T, O)
         choices=np.stack([row[1] for row in rows], 1),
         actions=np.stack([row[2] for row in rows], 1),
         final_observations=np.stack([s.final_observations for s in steps_], 1),
@@ -110,6 +112,7 @@ def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Ge
     envs = task.environments(episodes)
     parts: list[Rollout] = []
     observations, done = envs.reset(rng), np.zeros(episodes, bool)
+    # Blocks, so that it ends soon after the slowest environment; all episodes end at the horizon at the latest.
     block = min(task.horizon, 100)
     while not done.all():
         steps = min(block, task.horizon - sum(p.ends.shape[1] for p in parts))
