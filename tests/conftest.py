@@ -6,7 +6,9 @@ import math
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +44,21 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(runs.made_once(tmp_path_factory, "cache", Path.mkdir)))
         yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _warm(request: pytest.FixtureRequest, _own_cache: None) -> None:
+    """Where tests are held to a budget: what they all need is there, so that none pays for it by being the first."""
+    if request.config.getoption("--budget"):
+        for name in (
+            "torch.utils.tensorboard",
+            "transformers.models.gpt2.modeling_gpt2",
+            "matplotlib.pyplot",
+            "mujoco",
+        ):
+            with suppress(ImportError):
+                import_module(name)
+        request.getfixturevalue("finished_tiny")
 
 
 @pytest.fixture
@@ -140,6 +157,17 @@ def finished_tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         config = runs.tiny(name)
         made[name] = runs.made_once(tmp_path_factory, f"tiny-{number}", partial(runs.finish, config))
     return made
+
+
+@pytest.fixture(scope="session")
+def reviews_policy(tmp_path_factory: pytest.TempPathFactory, _own_cache: None) -> None:
+    """The starting policy of "text/reviews" has been made, which takes minutes, once for all tests."""
+
+    def make(folder: Path) -> None:
+        Config.load("text/reviews").build_task()
+        folder.mkdir()
+
+    runs.made_once(tmp_path_factory, "reviews-policy", make)
 
 
 @pytest.fixture(scope="session")

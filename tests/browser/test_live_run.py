@@ -18,7 +18,7 @@ LABELS = 90
 
 
 @pytest.fixture
-def running(tmp_path: Path) -> Any:
+def running(tmp_path: Path, reviews_policy: None) -> Any:
     """The command that a person would type, for fewer labels."""
     settings = ["labeler.kind=web", f"labeler.port={free_port()}", "labeler.enough=0.9", "labeler.strength=false"]
     size = ["loop.rounds=2", f"loop.labels={LABELS}", "learner.evaluation_prompts=128"]
@@ -43,7 +43,7 @@ def test_a_policy_improves_while_somebody_labels(
     running: Child, chromium: Browser, visit: Visit, tmp_path: Path
 ) -> None:
     with chromium.new_context() as context:
-        link = running.link(context.new_page(), seconds=400)  # a starting policy is made first
+        link = running.link(context.new_page())
     me = visit(link)
     me.allowed.append(LOST)  # the server ends with its run
     label(me, running)

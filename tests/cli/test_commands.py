@@ -45,7 +45,7 @@ def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
     assert "5 of 5" in prefrl.out
 
 
-def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgements(prefrl: Shell) -> None:
+def test_a_reward_model_is_graded_on_what_its_fit_left_out(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL} loop.labels=40 fitting.held_out=0.3") == 0
     at_the_end = json.loads(Path("run/card.json").read_text())
     assert "How good is the reward model?" in Path("run/report.html").read_text("utf-8")
@@ -55,6 +55,10 @@ def test_a_reward_model_is_graded_on_what_its_fit_left_out_or_on_other_judgement
     again["seconds"] = at_the_end["seconds"]  # the only thing that two times differ in
     assert again == at_the_end
     assert "<svg" in Path("card.html").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("toy_run")
+def test_a_reward_model_is_graded_on_other_judgements(prefrl: Shell) -> None:
     assert prefrl("label control/toy loop.labels=30 seed=5 --out labels") == 0
     assert prefrl("fit labels --out reward fitting.epochs=20 fitting.held_out=0.3") == 0
     assert prefrl("evaluate --reward reward") == 2

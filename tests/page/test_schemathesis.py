@@ -108,7 +108,7 @@ def hold_all(service: Service, operations: list[Any], role: str, mode: Generatio
 def test_whoever_asks_for_what_the_answer_is_a_declared_one(
     service: Service, operations: list[Any], role: str, mode: GenerationMode
 ) -> None:
-    hold_all(service, operations, role, mode, 3)
+    hold_all(service, operations, role, mode, 2)
 
 
 @pytest.mark.parametrize("role", ROLES)
