@@ -75,6 +75,7 @@ class ControlSettings(Settings):
             probe = make(self.env, **options)
             accepted = inspect.signature(type(probe.unwrapped).__init__).parameters
             if "terminate_when_unhealthy" in accepted and not self.variable_horizon:
+                # An episode that ends early tells by its length how it was judged.
                 options["terminate_when_unhealthy"] = False
                 probe = make(self.env, **options)
         except ModuleNotFoundError as error:

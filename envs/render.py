@@ -64,12 +64,13 @@ def _stroke(picture: Floats, begin: tuple[float, float], end: tuple[float, float
     size = len(picture)
     pixel = 3.0 / size
     rows, columns = (_span(begin[k] * sign, end[k] * sign, radius + pixel, size) for k, sign in ((1, -1.0), (0, 1.0)))
-    across = (np.arange(size, dtype=np.float32) + 0.5) * pixel - 1.5
+    across = (np.arange(size, dtype=np.float32) + 0.5) * pixel - 1.5  # the middle of each pixel
     dx, dy = across[None, columns] - begin[0], -across[rows, None] - begin[1]
     along = end[0] - begin[0], end[1] - begin[1]
+    # The nearest point of the line, as a share of its length; the maximum is for a dot, which has none.
     share = np.clip((dx * along[0] + dy * along[1]) / max(along[0] ** 2 + along[1] ** 2, 1e-12), 0.0, 1.0)
     distance = np.hypot(dx - share * along[0], dy - share * along[1])
-    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]
+    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]  # the edge fades over one pixel
     picture[rows, columns] += cover * (ink - picture[rows, columns])
 
 

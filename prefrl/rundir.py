@@ -61,7 +61,7 @@ class Run:
             self._events = _events(self.folder, self.loop.round)
             if isinstance(self.loop.labeler, Attended):
                 self.notes += self.loop.labeler.open(self.store)
-        except BaseException:
+        except BaseException:  # Ctrl-C too: a folder must not stay owned by a start that failed
             self.store.close()
             raise
 
@@ -78,6 +78,7 @@ class Run:
 
     def close(self) -> None:
         """Let go of the folder; people can answer until then."""
+        # The page before the store: its last answers are still to be written.
         if isinstance(self.loop.labeler, Attended):
             self.loop.labeler.close()
         self._events.close()
@@ -124,6 +125,7 @@ class Run:
         """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""
         row = {"round": round.number} | {k: v if math.isfinite(v) else None for k, v in round.metrics.items()}
         self._rows.append(row)
+        # Whole each time, not appended to: a kill leaves the old file or the new one, and no half line.
         write_file(self.folder / "metrics.jsonl", "".join(json.dumps(r) + "\n" for r in self._rows).encode())
         write_file(self.folder / "summary.json", json.dumps(self.summary, indent=1).encode())
         if round.fitted is not None and len(round.fitted.predicted):
@@ -157,7 +159,7 @@ class Run:
             save_state(folder, "reward", self.loop.reward.state())
             write_file(folder / "config.yaml", self.config.dump().encode())
             write_file(folder / "loop.json", json.dumps({"round": number, "store": self.loop.sequence}).encode())
-        for old in _checkpoints(self.folder)[KEEP:]:
+        for old in _checkpoints(self.folder)[KEEP:]:  # only once the new one stands
             shutil.rmtree(old)
 
     def _restore(self) -> list[dict[str, Any]]:
@@ -165,7 +167,7 @@ class Run:
 
         Labels that came after that checkpoint stay in the store, and count from the next fit on.
         """
-        for unfinished in (self.folder / "checkpoints").glob(".round-*"):
+        for unfinished in (self.folder / "checkpoints").glob(".round-*"):  # what a kill left of a checkpoint
             shutil.rmtree(unfinished)
         if not _checkpoints(self.folder):
             return []
@@ -176,6 +178,7 @@ class Run:
         found = json.loads((folder / "loop.json").read_text())
         self.loop.round, self.loop.sequence = found["round"], found["store"]
         self.notes.append(f"going on after round {self.loop.round}")
+        # A later row belongs to a round whose checkpoint is missing: it is done again.
         return [row for row in read_metrics(self.folder) if row["round"] <= self.loop.round]
 
 
@@ -238,7 +241,7 @@ def _claim(config: Config, folder: Path, store: Store[Any]) -> None:
     if _lasting(found) != _lasting(config):
         difference = _difference(_lasting(found), _lasting(config))
         raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")
-    write_file(path, config.dump().encode())
+    write_file(path, config.dump().encode())  # what may differ from start to start, a port say, is kept as it is now
 
 
 def _lasting(config: Config) -> Config:
@@ -290,4 +293,4 @@ def _events(folder: Path, round: int) -> Any:
     """TensorBoard's event files, beside the rest."""
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder), purge_step=round + 1)
+    return SummaryWriter(str(folder), purge_step=round + 1)  # drops what it holds of rounds that are done again

@@ -28,6 +28,7 @@ class Streams:
 
 def streams(seed: int, round: int) -> Streams:
     """The streams of a round (0 is before the first)."""
+    # By place: a new stage belongs at the end, or every stage after it would draw other numbers.
     keys = {f.name: (0 if f.name == "evaluate" else round, i) for i, f in enumerate(fields(Streams))}
     return Streams(
         **{name: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=k)) for name, k in keys.items()}
@@ -36,6 +37,7 @@ def streams(seed: int, round: int) -> Streams:
 
 def keyed(base: int, key: str) -> np.random.Generator:
     """A generator for one named thing (a query, say): the same whatever was drawn before it."""
+    # Not Python's hash(), which differs from one process to the next.
     return np.random.default_rng([base, int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "big")])
 
 

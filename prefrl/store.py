@@ -66,6 +66,7 @@ class Store(Generic[C]):
         """
         candidates = {c.id: c for query in queries for c in query.candidates}
         self._check_kind(candidates.values())
+        # Files before events: what the log names must be there, and a file that it does not name does no harm.
         self._file(candidates.values())
         more: list[dict[str, Any]] = [{} for _ in queries]
         if purpose != "label":
@@ -145,7 +146,7 @@ class Store(Generic[C]):
     def _file(self, candidates: Iterable[Candidate]) -> None:
         """Write arrays and gold, each under its id; in threads, since each file waits for the disk."""
         with ThreadPoolExecutor(WRITERS) as pool:
-            list(pool.map(self._file_one, candidates))
+            list(pool.map(self._file_one, candidates))  # waits, and raises what a thread raised
 
     def _file_one(self, candidate: Candidate) -> None:
         if isinstance(candidate, Segment):

@@ -42,6 +42,7 @@ class Pendulum:
         torque = np.clip(actions[:, 0].astype(np.float32), np.float32(-2), np.float32(2))
         wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
         costs = wrapped**2 + 0.1 * velocity**2 + 0.001 * torque**2
+        # Before the angle, which moves by the new velocity, as in gymnasium.
         velocity = np.clip(velocity + (15.0 * np.sin(angle) + 3.0 * torque) * 0.05, -8.0, 8.0)
         return np.stack([angle + velocity * 0.05, velocity], 1), -costs, np.zeros(len(states), bool)
 
@@ -72,6 +73,7 @@ class CartPole:
         push = (force + 0.05 * np.square(spin) * sin) / 1.1
         spin_rate = (9.8 * sin - cos * push) / (0.5 * (4.0 / 3.0 - 0.1 * np.square(cos) / 1.1))
         acceleration = push - 0.05 * spin_rate * cos / 1.1
+        # Each position moves by the old velocity: gymnasium's default is Euler.
         x, velocity = x + 0.02 * velocity, velocity + 0.02 * acceleration
         angle, spin = angle + 0.02 * spin, spin + 0.02 * spin_rate
         following = np.where(down[:, None], states, np.stack([x, velocity, angle, spin], 1))
@@ -105,8 +107,9 @@ class Vectorised:
     def step(self, actions: Floats) -> Transition:
         states, rewards, terminated = self._dynamics.advance(self._states, actions)
         self._elapsed += 1
+        # Never both: where something follows to bootstrap from, and where nothing does, must be told apart.
         truncated = (self._elapsed >= self._horizon) & ~terminated
-        final = observations = self._dynamics.observe(states)
+        final = observations = self._dynamics.observe(states)  # before any reset below
         ended = terminated | truncated
         if ended.any():
             states[ended] = self._dynamics.start(int(ended.sum()), self._rng)

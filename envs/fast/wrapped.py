@@ -37,9 +37,9 @@ class Wrapped:
         truncated = np.array([bool(s[3]) for s in steps]) & ~terminated
         if self._fixed_horizon and terminated.any():
             raise ValueError(_early_end(self._envs[0]))
-        observations = final.copy()
+        observations = final.copy()  # a reset must not change what the step led to
         for i in np.flatnonzero(terminated | truncated):
-            observations[i] = self._envs[i].reset()[0]
+            observations[i] = self._envs[i].reset()[0]  # without a seed: the generator that `reset` seeded goes on
         return Transition(observations, np.array([float(s[1]) for s in steps]), terminated, truncated, final)
 
     def states(self) -> Floats | None:

@@ -57,6 +57,7 @@ class Pairs:
     @property
     def margin(self) -> Floats:
         """(M,) abs of the logit of `predicted`, right for probabilities that round to 0 or 1 as well."""
+        # (M,) each: sums in place of means over members, whose log E cancels below.
         log_p, log_q = (logsumexp(log_expit(sign * self.logits), axis=0) for sign in (1, -1))
         found: Floats = np.abs(log_p - log_q)
         return found
@@ -83,6 +84,7 @@ def buckets(pairs: Pairs, margin: Floats, rng: np.random.Generator, lengths: boo
     some, margin = pairs.take(keep), margin[keep]
     if not len(some):
         return []
+    # An observed value as a border, not one between two: equal margins then fall on one side of it.
     edges = np.unique(np.quantile(margin, np.linspace(0, 1, BUCKETS + 1)[1:-1], method="inverted_cdf"))
     at = np.searchsorted(edges, margin)
     return [_bucket(some.take(at == i), margin[at == i], rng, lengths) for i in np.unique(at)]

@@ -35,7 +35,7 @@ def reliability(predicted: Floats, preference: Floats, bins: int = 5) -> tuple[B
     turned = predicted < 0.5
     confidence = np.where(turned, 1.0 - predicted, predicted).astype(np.float64)
     won = np.where(turned, 1.0 - preference, preference).astype(np.float64)
-    place = np.minimum((confidence - 0.5) * 2 * bins, bins - 1).astype(int)
+    place = np.minimum((confidence - 0.5) * 2 * bins, bins - 1).astype(int)  # 1.0 belongs to the last bin
     return tuple(_bin(confidence[place == i], won[place == i]) for i in range(bins) if (place == i).any())
 
 

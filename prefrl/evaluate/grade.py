@@ -47,7 +47,7 @@ class Habits:
     def answering(self, labelers: Sequence[str]) -> Answering:
         """Of the labeler of each comparison (M,)."""
         ties: Ties = "half" if self.tie is None else self.fitting.ties
-        share = 1 / 2 if ties == "half" else 2 / 3
+        share = 1 / 2 if ties == "half" else 2 / 3  # a blind answer among n is wrong n - 1 times in n
         assumed = self.fitting.error_rate * share
         error = [self.error_rates.get(name, assumed) for name in labelers]
         return Answering(ties, self.tie or 0.0, np.array(error))
@@ -219,6 +219,7 @@ def _about(subject: Subject, pairs: Pairs, candidates: Sequence[Candidate]) -> A
 def _calibration(pairs: Pairs, answering: Answering, rng: np.random.Generator) -> Calibration:
     """Of the answers, not of what is felt: ties and mistakes are in them."""
     p, y, half = answering.expected(pairs.logits), pairs.preference, _halves(pairs, rng)
+    # Each half is cooled by the temperature of the other: fitted and measured on one, it would always help.
     others = [np.flatnonzero(half != own) for own in (0, 1)] if len(half) else []
     found = [temperature(pairs.logits[:, at], y[at], answering.of(at)) for at in others]
     cooled = pairs.logits / np.array(found)[half] if found else pairs.logits
@@ -237,7 +238,7 @@ def _calibration(pairs: Pairs, answering: Answering, rng: np.random.Generator) -
 def _halves(pairs: Pairs, rng: np.random.Generator) -> Integers:
     """(M,) 0 or 1: two halves, clusters kept whole; nothing where one would be too small to fit a temperature on."""
     names, at = np.unique(pairs.cluster, return_inverse=True)
-    half = (rng.permutation(len(names)) % 2)[at]
+    half = (rng.permutation(len(names)) % 2)[at]  # (M,): whole clusters, dealt out in turn
     return half if min(np.bincount(half, minlength=2)) >= HALF else half[:0]
 
 

@@ -53,7 +53,9 @@ def share(hits: Floats, cluster: Integers, rng: np.random.Generator, what: str =
         return Estimate(value=value, low=max(low, 0.0), high=min(high, 1.0), count=len(hits), how=how)
     if len(counts) < FEW:
         return Estimate(value=value, count=len(hits), how=f"no interval: only {len(counts)} {what}")
+    # (RESAMPLES, clusters): how often each cluster is drawn, which is all that sums need.
     drawn = rng.multinomial(len(counts), np.full(len(counts), 1 / len(counts)), size=RESAMPLES)
+    # A ratio of sums, as clusters differ in size: a mean of their means would weigh small ones too much.
     low, high = np.percentile((drawn @ sums) / (drawn @ counts), (2.5, 97.5))
     return Estimate(value=value, low=low, high=high, count=len(hits), how=f"bootstrap over {len(counts)} {what}")
 

@@ -21,7 +21,7 @@ EXAMPLE_RESPONSES = 4
 
 def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
     """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`; and openings to look at."""
-    lengths = rollout.ends.argmax(1) + 1
+    lengths = rollout.ends.argmax(1) + 1  # (n,): argmax is the first end; what comes after it does not count
     mask = np.arange(rollout.ends.shape[1]) < lengths[:, None]
     gold = np.where(mask, rollout.gold, 0.0).sum(1)
     learned = np.where(mask, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)

@@ -47,7 +47,7 @@ def export_bundle(store: Store[Any], path: Path) -> Exported:
 
 
 def _event_text(one: Mapping[str, Any]) -> str:
-    body = json.loads(json.dumps(one["body"], sort_keys=True))
+    body = json.loads(json.dumps(one["body"], sort_keys=True))  # sorted at every depth: the same store, the same bytes
     return json_text({name: body if name == "body" else one[name] for name in FIELDS})
 
 
@@ -79,6 +79,7 @@ def _check_files(path: Path) -> None:
         raise ValueError(f"{path} is no whole bundle: {MANIFEST} cannot be read: {error}") from None
     if not isinstance(hashes, dict) or EVENTS not in hashes:
         raise ValueError(f"{path} is no whole bundle: {MANIFEST} does not name {EVENTS}")
+    # All names before any file: none is opened that lies outside.
     for name in hashes:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name:
             raise ValueError(f"{path}: {MANIFEST} names {name!r}, which lies outside: refused")

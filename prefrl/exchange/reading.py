@@ -64,12 +64,14 @@ def read_lines(path: Path, ends: bool = False) -> Iterator[str]:
     """The lines of a UTF-8 file (.gz or not), cut at line feeds alone; `ends` keeps what ends them."""
     with _opened(path) as source:
         number = 0
+        # One byte more than is allowed: a row that is too long shows without being read to its end.
         while line := source.file.readline(ROW_LIMIT + 1):
             number += 1
             if len(line) > ROW_LIMIT:
                 raise ValueError(f"{path}: row {number} is longer than {ROW_LIMIT >> 20} MB, the most a row may have")
             source.check(len(line))
             try:
+                # A byte order mark stands at the start alone; anywhere else it is text.
                 text = line.decode("utf-8-sig" if number == 1 else "utf-8")
             except UnicodeDecodeError as error:
                 raise ValueError(f"{path}: row {number} is no UTF-8 text ({error.reason}); convert the file") from None
@@ -88,6 +90,7 @@ class _Source:
     def check(self, count: int) -> None:
         """Note `count` bytes more. Raises `ValueError` where far more come out than went in."""
         self.read += count
+        # Against how much of the packed file was read so far, not its size: the bomb may be in the middle.
         if self.read > UNPACKED_FREELY and self.read > UNPACKED_RATIO * max(self.raw.tell(), 1):
             raise ValueError(
                 f"{self.path} unpacks to over {UNPACKED_RATIO} times its size: it is refused; unpack it yourself if "
@@ -203,7 +206,7 @@ def _element(text: _Text, decoder: json.JSONDecoder) -> Any:
         except json.JSONDecodeError as error:
             if len(text.text) - text.at > ROW_LIMIT or not text.more(least):
                 raise ValueError(f"{error.msg}, or a row of more than {ROW_LIMIT >> 20} MB") from None
-            least *= 2
+            least *= 2  # so that an element is parsed anew only a few times, however long it is
 
 
 # --- tables -------------------------------------------------------------------------------------------------------
@@ -255,7 +258,7 @@ def _arrow(path: Path) -> Iterator[Any]:
 def _small(path: Path, batch: Any) -> Iterator[Any]:
     for start in range(0, batch.num_rows, 64):
         some = batch.slice(start, 64)
-        if some.nbytes > 64 * ROW_LIMIT:
+        if some.nbytes > 64 * ROW_LIMIT:  # before to_pylist, whose objects take many times as much
             raise ValueError(f"{path}: rows of more than {ROW_LIMIT >> 20} MB, the most a row may have")
         yield from some.to_pylist()
 

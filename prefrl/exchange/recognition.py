@@ -35,6 +35,7 @@ def _placed(row: Row, query: Query[Any]) -> Row:
     """A row as an answer to the query that it names; as it is where the candidates are others."""
     places = {_bare(candidate): at for at, candidate in enumerate(query.candidates)}
     own = [_bare(candidate) for candidate in row.query.candidates]
+    # Two candidates that differ only in what a file loses cannot be told apart, so the row is left as it is.
     if len(places) < len(query.candidates) or set(own) != set(places):
         return row
     answer = _turned(row.answer, [places[id] for id in own])

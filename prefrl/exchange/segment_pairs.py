@@ -27,7 +27,7 @@ def segment_pairs(path: Path) -> Parts:
     """(part and row, what reads it) for each pair. Raises `ValueError` where arrays are missing or do not fit."""
     try:
         with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
+            archive = np.load(file, allow_pickle=False)  # a pickle can run any code
             if not isinstance(archive, Mapping):
                 raise ValueError("expected an archive of arrays, got one array")
             splits = [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
@@ -69,7 +69,7 @@ def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], sp
     """One pair with every labeler's judgement on it."""
     first, second = (_segment(arrays, split, side, i) for side in ("1", "2"))
     query = Query((first, second))
-    swapped = query.candidates[0].id != first.id
+    swapped = query.candidates[0].id != first.id  # a query sorts its candidates by id
     rows: list[Row | str] = []
     for labeler, values in labels.items():
         value = float(values[i])
@@ -81,7 +81,7 @@ def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], sp
 
 def _segment(arrays: Mapping[str, np.ndarray], split: str, side: str, i: int) -> Segment:
     """A segment that is called after its part and its content: the same one in two pairs is one candidate."""
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
         observations, actions = (arrays[f"{name}_{side}"][i].astype(np.float32) for name in ("obs", "action"))
     for name, values in ((f"obs_{side}", observations), (f"action_{side}", actions)):
         bad = np.argwhere(~np.isfinite(values))

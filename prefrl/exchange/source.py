@@ -35,6 +35,7 @@ def open_judgements(source: Path, task: Any, which: Which | None = None) -> Iter
         if source.is_dir() and not (which and (which.labelers or which.split)):
             opened = Opened(stack.enter_context(Store[Any](source, write=False)), ())
         else:
+            # Entered first, so removed last: the store in it is closed by then.
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             opened = _chosen(source, stack.enter_context(Store[Any](scratch)), which)
         check_candidates(opened.store.judged(), task)

@@ -77,6 +77,7 @@ def clear_queries(
     rows = np.array(known)[groups]
     ranked = np.sort(gold[rows].astype(np.float64), axis=1)
     gap = ranked[:, -1] - ranked[:, -2]
+    # A quantile, not a size: gold is on any scale.
     least_gap = np.quantile(gap, 1 - top)
     if least_gap <= TINY * np.abs(gold[known]).max():
         return Checks([], [], "gold differs too little for an answer to be clear")
@@ -112,6 +113,7 @@ def _groups(candidates: Sequence[C], size: int, rng: np.random.Generator) -> Int
     for i in rng.integers(len(candidates), size=TRIES):
         members = by_context[candidates[i].context]
         if len(members) >= size:
+            # Sorted, so that the same group in another order is not found again.
             group = sorted(members[j] for j in rng.choice(len(members), size, replace=False))
             episodes = [c.episode for c in (candidates[j] for j in group) if isinstance(c, Segment)]
             if len(set(episodes)) == len(episodes):
@@ -125,6 +127,7 @@ def _sample(contexts: Sequence[str], rng: np.random.Generator) -> list[int]:
     for i, context in enumerate(contexts):
         by_context[context].append(i)
     names = list(by_context)
+    # Context by context: MOST single candidates of as many prompts would make no group at all.
     order = [i for at in rng.permutation(len(names)) for i in rng.permutation(by_context[names[at]]).tolist()]
     return sorted(order[:MOST])
 

@@ -58,6 +58,7 @@ class Crowd:
         queries = store.open_queries(self.name)
         if not queries:
             return
+        # Once, before anybody answers: limits must not hang on who of the crowd came first.
         asked = survey(store, self.name)
         limits = {a.name: a.limits(asked) for a in self.annotators}
         willing = {a.name: {q.id for q in store.open_queries(a.name)} for a in self.annotators}
@@ -75,5 +76,6 @@ class Crowd:
             if sum(not isinstance(a, Skip) for a in answers) == self.settings.overlap:
                 break
             if one.name in able:
+                # A generator for each: who else answers does not change what is said.
                 answers.append(one.judge(query, gold, keyed(base, f"{query.id}/{one.name}"), able[one.name]))
         return answers

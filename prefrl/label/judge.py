@@ -177,7 +177,7 @@ class Judge:
         """The probability that the first response shown is better, for each question; those of like length together."""
         self._check_room(max(map(len, questions), default=0))
         order = sorted(range(len(questions)), key=lambda i: len(questions[i]))
-        found = np.full(len(questions), np.nan)
+        found = np.full(len(questions), np.nan)  # no answer yet, and a refusal stays so
         for start in range(0, len(order), self.settings.batch_size):
             chunk = order[start : start + self.settings.batch_size]
             ids, mask = _left_padded([questions[i] for i in chunk])
@@ -187,13 +187,15 @@ class Judge:
     @torch.no_grad()
     def _next(self, ids: Tensor, mask: Tensor) -> Floats:
         """From the probabilities of the next token; NaN where the answers have too little of them."""
+        # Padding on the left is not counted: absolute positions would otherwise depend on the rest of the batch.
         positions = (mask.cumsum(1) - 1).clamp(min=0)
         out = self.model(input_ids=ids, attention_mask=mask, position_ids=positions, use_cache=False, logits_to_keep=1)
-        log_p = out.logits[:, -1].float().log_softmax(-1)
+        log_p = out.logits[:, -1].float().log_softmax(-1)  # (B, V), in float32: near probabilities decide
         if log_p.isnan().any():
             raise ValueError("the judge's model gave logits that are not numbers: use another labeler.model")
         first, second = (log_p[:, tokens].logsumexp(1).double() for tokens in self._tokens)
         mass = first.exp() + second.exp()
+        # first / (first + second), which for two tiny probabilities would be 0 / 0.
         share = torch.sigmoid(first - second)
         found: Floats = torch.where(mass < self.settings.minimum_mass, torch.nan, share).numpy()
         return found
@@ -245,6 +247,7 @@ def _ranks(preferences: Floats, size: int) -> tuple[int, ...]:
     for (i, j), p in zip(combinations(range(size), 2), preferences, strict=True):
         wins[i] += p
         wins[j] += 1 - p
+    # Ranks step only where neighbours are more than rounding apart, so near equals share one.
     order = np.argsort(-wins, kind="stable")
     ranks: Integers = np.empty(size, np.int64)
     ranks[order] = np.cumsum([0, *(wins[order][:-1] - wins[order][1:] > EQUAL)])

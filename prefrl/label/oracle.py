@@ -108,6 +108,7 @@ class Oracle:
         So a run that was killed gives the same ones when it goes on. Raises `ValueError` where gold is not finite.
         """
         base = draw_seed(rng)
+        # A generator for each query by its id: who answered what before, and in which order, changes nothing.
         queries = store.open_queries(self.name)
         limits = self.limits(teachers.survey(store, self.name) if queries and self.settings.relative else None)
         store.answer([self.judge(q, store.gold(q.candidates), keyed(base, q.id), limits) for q in queries])
@@ -118,6 +119,7 @@ class Oracle:
         found = Limits(-np.inf if s.skip_below is None else s.skip_below, s.tie_within, s.rationality)
         if not s.relative or asked is None or not asked.queries:
             return found
+        # In this order: thresholds are taken of what is seen, length included, and noise of what is not skipped.
         found = self._with_length(found, asked)
         seen = teachers.blocks([self.see(q, asked.gold[q.id], found) for q in asked.queries])
         return self._with_noise(self._with_thresholds(found, asked, seen), seen)
@@ -178,6 +180,7 @@ class Oracle:
         if self.settings.judgement == "rating":
             return self._rate(query, worth, mistaken, shown, limits)
         if rng.random() < self.settings.position_bias:
+            # A group stands where its first one was shown: what is equal stays equal.
             worth = -np.array([min(shown.index(j) for j in np.flatnonzero(groups[0] == g)) for g in groups[0]], float)
         return self._order(query, -worth if mistaken else worth, shown, rng)
 

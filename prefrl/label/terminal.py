@@ -59,6 +59,7 @@ class Terminal:
         while queries := store.open_queries(self.name):
             self.console.rule(f"{len(done)} answered, {len(queries)} to go")
             query = queries[0]
+            # By the query's id: asked again after an undo, it looks the same.
             shown = keyed(base, query.id).permutation(len(query.candidates)).tolist()
             self._show(query, shown)
             typed = self._ask(len(shown))

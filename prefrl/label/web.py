@@ -194,6 +194,7 @@ class WebLabeler:
         """How many more questions must be judged before a round goes on; what everybody skipped is let go."""
         asked, judged, stuck = site.judged()
         share = self.settings.enough if self.settings.when_empty == "wait" else 0.0
+        # 0.07 * 100 is a little more than 7 in floating point, and would be rounded up to 8.
         wanted = max(1, math.ceil(share * (asked - stuck) - 1e-9))
         return min(asked - stuck, wanted) - judged
 
@@ -206,6 +207,7 @@ class WebLabeler:
         asked = store.counts()["asked"]
         if not self.settings.check_share or asked == self._checked:
             return
+        # Noted, so that a wait without new questions files no second set of checks.
         self._checked, open_ids = asked, site.open_queries()
         some = rng.permutation(len(open_ids))[: LOOKED_AT[self.task.kind]]
         looked_at = [cast(Any, store).query(open_ids[i]) for i in sorted(some.tolist())]

@@ -85,7 +85,7 @@ def _add_pages(app: FastAPI, title: str) -> None:
         if served.clips is None:
             raise Refused(404, "there is no such clip")
         path = await served.clips.get(name, CLIP_SECONDS)
-        headers = {"cache-control": "private, max-age=31536000, immutable"}
+        headers = {"cache-control": "private, max-age=31536000, immutable"}  # what looks otherwise has another name
         return FileResponse(path, media_type=MEDIA[name.rpartition(".")[2]], headers=headers)
 
 
@@ -106,6 +106,7 @@ def _add_session(app: FastAPI) -> None:
         await served.record(events)
         secure = request.url.scheme == "https"
         name = cookie_name(served)
+        # No script can read it, and no other site can have it sent along.
         response.set_cookie(name, token, max_age=MONTH, httponly=True, samesite="strict", secure=secure)
         return await _me(served, found)
 

@@ -90,6 +90,7 @@ class Desk:
         The new ones are leased from now on; they are to be written down, or given to `abandon`.
         """
         with self._lock:
+            # First: a question whose lease ran out in the meantime is free for this person.
             self._pool.sweep()
             mine = self._person(annotator).held.values()
             held = list(islice((given for given in mine if self._revive(given)), want))
@@ -125,6 +126,7 @@ class Desk:
         if question is None:
             return None
         assert person.past is not None  # `tell` comes first
+        # By person and number: after a restart, checks and repeats come where they would have come without it.
         rng = keyed(self.policy.seed, f"{annotator}#{person.past.given}")
         draw, pick = rng.random(), float(rng.random())
         given: Given | None = None
@@ -132,7 +134,7 @@ class Desk:
             given = self._check(annotator, pick, guideline)
         elif draw < self.policy.check_share + self.policy.repeat_share:
             given = self._repeat(person.past, pick, guideline)
-        if given is None:
+        if given is None:  # also where no check or repeat is left for this person
             self._pool.lease(question, annotator)
             given = self._give(question, annotator, guideline)
         person.past.given += 1
@@ -215,7 +217,7 @@ class Desk:
         """Have an assignment wait for another answer, before all others of its person."""
         person = self._person(given.annotator)
         person.held.pop(given.id, None)
-        person.held = {given.id: given} | person.held
+        person.held = {given.id: given} | person.held  # a dict keeps its order, so this one comes first
         person.undone.add(given.id)
         return person
 

@@ -82,6 +82,7 @@ class Intake:
         for something else.
         """
         digest = _digest(name, sent)
+        # A client that got no reply sends again: the log knows whether the first one arrived, also after a crash.
         if (seq := self._known(tx.connection, sent.submission_id, digest)) is not None:
             return Taken(seq, duplicate=True)
         given, answered = self._own(tx.connection, name, sent.assignment_id)
@@ -180,7 +181,7 @@ def _ranks(sent: api.Answer, shown: tuple[int, ...]) -> tuple[int, ...]:
     if by_slot is None or len(by_slot) != len(shown):
         got = sent.outcome if by_slot is None else f"one of {len(by_slot)}"
         raise Refused(422, f"this question has {len(shown)} candidates: expected a ranking of them, got {got}")
-    return tuple(rank for _, rank in sorted(zip(shown, by_slot, strict=True)))
+    return tuple(rank for _, rank in sorted(zip(shown, by_slot, strict=True)))  # from slots to the query's own order
 
 
 def _digest(name: str, sent: api.Body) -> str:

@@ -75,7 +75,7 @@ class Pool:
         """The first free question that this person was never given: the newest batch first, then as asked."""
         walk = self._walks[annotator]
         while walk.returned and not self._suits(walk.returned[0][2], annotator):
-            heapq.heappop(walk.returned)
+            heapq.heappop(walk.returned)  # taken by somebody else since, or closed
         found = [self._questions[walk.returned[0][2]]] if walk.returned else []
         for batch in self._batches:
             ids, place = self._lists[batch], walk.places.get(batch, 0)
@@ -94,6 +94,7 @@ class Pool:
             self._walks[annotator].seen_free += question.free
         until = self._clock() + self.lease_seconds
         question.leases[annotator] = until
+        # An older entry of the same lease is left on the heap: `sweep` sees that the lease was extended.
         heapq.heappush(self._expiries, (until, question.id, annotator))
         self._update(question)
 

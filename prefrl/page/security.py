@@ -29,19 +29,20 @@ HEAD = 16 * 1024
 SAFE = ("GET", "HEAD")
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 POLICY = (
+    # Nothing from elsewhere and no script inside a page, so that a text to be judged can never run as one.
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'; "
     "require-trusted-types-for 'script'"
 )
 HEADERS = {
     b"content-security-policy": POLICY.encode(),
-    b"x-content-type-options": b"nosniff",
-    b"referrer-policy": b"no-referrer",
-    b"x-frame-options": b"DENY",
-    b"cross-origin-opener-policy": b"same-origin",
-    b"cross-origin-resource-policy": b"same-origin",
-    b"permissions-policy": b"camera=(), geolocation=(), microphone=()",
-    b"cache-control": b"no-store",
+    b"x-content-type-options": b"nosniff",  # no guessing: a text stays a text
+    b"referrer-policy": b"no-referrer",  # other sites do not learn where people came from
+    b"x-frame-options": b"DENY",  # as frame-ancestors: nobody clicks unawares through a frame of another site
+    b"cross-origin-opener-policy": b"same-origin",  # a page that opened this one gets no hold of its window
+    b"cross-origin-resource-policy": b"same-origin",  # clips cannot be embedded elsewhere
+    b"permissions-policy": b"camera=(), geolocation=(), microphone=()",  # nothing here films or listens
+    b"cache-control": b"no-store",  # on a shared machine the next person finds nothing
 }
 """On every response; what a response says itself stands."""
 log = logging.getLogger(__name__)
@@ -83,6 +84,7 @@ class Guard:
         answer = _Answer(send)
         try:
             check_head(scope, self.rules)
+            # Read to its end before the application sees it: nothing inside has to wait for a slow client.
             body = await self._body(scope, receive)
             async with asyncio.timeout(self.rules.seconds) as timer:
                 await self.app(scope, _replay(body, receive), self._in_time(timer, answer.send))
@@ -111,7 +113,7 @@ class Guard:
         length = headers.get(b"content-length", b"0")
         if b"content-length" in headers and b"transfer-encoding" in headers:  # a proxy may believe the other one
             raise Refused(400, "a body has a Content-Length or a Transfer-Encoding, not both")
-        if not length.isdigit() or len(length) > 12:
+        if not length.isdigit() or len(length) > 12:  # int() raises at thousands of digits
             raise Refused(400, "the header Content-Length is no number")
         most = LARGER.get((scope["method"], scope["path"]), BODY)
         if int(length) > most:
@@ -188,6 +190,7 @@ class Buckets:
     def take(self, key: str) -> None:
         """Raise `Refused` with the seconds to wait where the key's bucket is empty."""
         now = self._clock()
+        # Taken out, and put back at the end: the order is that of use.
         level, since = self._levels.pop(key, (self.burst, now))
         level = min(self.burst, level + (now - since) * self.rate)
         self._levels[key] = (max(level - 1, 0.0) if level >= 1 else level, now)

@@ -89,8 +89,8 @@ class WebServer:
             log_config=None,
             log_level="critical",
             access_log=False,
-            proxy_headers=False,
-            server_header=False,
+            proxy_headers=False,  # anybody could name another address in X-Forwarded-For
+            server_header=False,  # no version for those who look for old ones
             limit_concurrency=MOST,
             backlog=BACKLOG,
             timeout_keep_alive=15,

@@ -132,7 +132,7 @@ class Site:
     @contextmanager
     def _sparing(self) -> Iterator[None]:
         """A look at all questions after each answer would leave no time for the answers, where there are many."""
-        begin = time.thread_time()
+        begin = time.thread_time()  # this thread's own: waiting for others is no reason to look less often
         yield
         self._pause = SPARING * (time.thread_time() - begin)
 
@@ -147,7 +147,7 @@ def open_site(store: Store[Any], terms: Terms, address: Address, name: str, clip
     drawn = Clips(store.folder, clips) if clips is not None else None
     service = Service(store, terms, drawn)
     server = WebServer(create_app(service, Rules(frozenset(address.names()))), tls)
-    service.open()
+    service.open()  # before the server: the first request finds everything loaded
     site = Site(service, drawn, server)
     try:
         port = server.start(address.host, address.port)

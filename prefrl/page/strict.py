@@ -44,6 +44,7 @@ def check_json(body: bytes) -> None:
 
 def _check_depth(body: bytes) -> None:
     depth = 0
+    # Before parsing, and outside of strings, where brackets are text: a deep body would cost the parser its stack.
     for bracket in re.findall(rb"[\[\]{}]", _STRING.sub(b"", body)):
         depth += 1 if bracket in b"[{" else -1
         if depth > DEPTH:

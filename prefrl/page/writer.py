@@ -62,6 +62,7 @@ class Writer:
 
     def close(self) -> None:
         """Take no more jobs, write those that wait, and end."""
+        # Behind the gate nobody can slip a job in after the None that ends the thread.
         with self._gate:
             self._closed = True
         if self._thread.is_alive():
@@ -96,7 +97,7 @@ class Writer:
                 _fail(job, Unavailable("answers cannot be stored just now: try again in a moment"))
                 return job.future
             try:
-                self._queue.put_nowait(job)
+                self._queue.put_nowait(job)  # never put(): the event loop must not wait here
             except queue.Full:
                 _fail(job, Unavailable("too many answers wait to be stored: try again in a moment"))
         return job.future
@@ -182,7 +183,7 @@ def _begin(job: _Job) -> bool:
 
 def _attempt(job: _Job, at: Transaction) -> None:
     try:
-        with at.savepoint():
+        with at.savepoint():  # what one job wrote before it failed is undone, and the others stand
             job.result = job.run(at)
     except (StoreFull, OperationalError):  # the database may have undone everything: there is no going on
         raise

@@ -23,11 +23,11 @@ def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
     much as `length` others: its edges would else be seen `length` times less often than its middle.
     """
     ends, begins = rollout.ends, rollout.begins
-    episode = begins.cumsum(1)
+    episode = begins.cumsum(1)  # (n, T): steps of one episode have one number
     last = ends.shape[1] - length
     if last < 0:
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    inside = episode[:, : last + 1] == episode[:, length - 1 :]
+    inside = episode[:, : last + 1] == episode[:, length - 1 :]  # (n, last + 1)
     starts = np.argwhere(inside)
     env, t = starts.T
     at_edge = begins[env, t] | ends[env, t + length - 1]
@@ -43,6 +43,7 @@ def cut(rollout: Rollout, length: int, count: int, name: str, rng: np.random.Gen
             "were asked for; lower loop.pool or the segment length, or raise learner.steps_per_round"
         )
     chosen = rng.choice(len(starts), count, replace=False, p=weights / weights.sum())
+    # Oldest first, so that a selector can take the newest from the end.
     by_time = starts[chosen][np.argsort(starts[chosen, 1], kind="stable")]
     return [segment(rollout, int(env), int(t), length, name) for env, t in by_time]
 
@@ -53,6 +54,7 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
     begin = int(before[-1]) + 1 if len(before) else 0
     part = (env, slice(t, t + length))
     return Segment(
+        # By value: a view would keep the whole rollout in memory for as long as the segment is.
         observations=rollout.observations[part].copy(),
         actions=rollout.actions[part].copy(),
         episode=f"{name}/{env}/{begin}",
@@ -69,6 +71,7 @@ def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.ra
     early to hold that many windows.
     """
     episodes = max(1, math.ceil(count * task.segment_steps / (OVERLAP * task.horizon)))
+    # As many equal passes as it takes, over no more environments than are needed to fill them.
     passes = math.ceil(episodes / most)
     n = math.ceil(episodes / passes)
     envs, parts, held, longest = task.environments(n), list[Rollout](), 0, 0
@@ -87,7 +90,7 @@ def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.ra
 def _ages(ends: np.ndarray, before: np.ndarray) -> np.ndarray:
     """(n, T): which step of its episode each is, from 1, where `before` (n,) steps came earlier."""
     at = np.arange(ends.shape[1])
-    begins = np.where(np.roll(ends, 1, 1), at, -before[:, None])
+    begins = np.where(np.roll(ends, 1, 1), at, -before[:, None])  # the roll wraps to column 0, set below
     begins[:, 0] = -before
     ages: np.ndarray = at + 1 - np.maximum.accumulate(begins, 1)
     return ages

@@ -55,10 +55,10 @@ def mean(hits: Floats, unit: Integers, rng: np.random.Generator, resamples: int 
     """
     rows, sizes = patterns(np.column_stack([hits, np.ones(len(hits))]), unit)
     value, units = float(hits.mean()), int(sizes.sum())
-    if units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0:
+    if units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0:  # (P,): the mean of each pattern of units
         wilson = stats.binomtest(round(value * units), units).proportion_ci(method="wilson")
         return Measured(value, min(float(wilson.low), value), max(float(wilson.high), value), len(hits))
-    sums = (weights @ rows for weights in draws(sizes, resamples, rng))
+    sums = (weights @ rows for weights in draws(sizes, resamples, rng))  # (n, 2): hits, and how many there were
     return defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Measured(count=len(hits)))
 
 
@@ -85,7 +85,7 @@ def patterns(parts: Floats, unit: Integers) -> tuple[Floats, Integers]:
     at = numbered(unit)
     if len(at) > (units := int(at.max()) + 1):
         parts = np.asarray(csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(units, len(at))) @ parts)
-    order = np.lexsort(parts.T)
+    order = np.lexsort(parts.T)  # equal rows become neighbours
     ordered = parts[order]
     first = np.flatnonzero(np.r_[True, (ordered[1:] != ordered[:-1]).any(1)])
     return ordered[first], np.diff(np.r_[first, len(ordered)])
@@ -100,6 +100,7 @@ def draws(sizes: Integers, resamples: int, rng: np.random.Generator) -> Iterator
 def resampled(units: int, width: int, resamples: int, rng: np.random.Generator) -> Iterator[Floats]:
     """Resamples of units: (n, units) how often each comes up, in chunks that leave room for (n, width)."""
     for n in _chunks(resamples, max(units, width)):
+        # Each resample counts in a range of its own, so that one bincount does for all.
         at = rng.integers(units, size=(n, units)) + units * np.arange(n)[:, None]
         yield np.bincount(at.ravel(), minlength=n * units).reshape(n, units).astype(np.float64)
 

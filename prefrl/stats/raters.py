@@ -46,6 +46,7 @@ class Ratings:
             raise ValueError(f"ratings need columns of one length, got lengths {sorted(sizes)}")
         if self.size > MOST_CATEGORIES:
             raise ValueError(f"expected at most {MOST_CATEGORIES} categories, got {self.size}: put near ones together")
+        # One number for each pair of item and rater, so that a second answer shows.
         if len(np.unique(self.items * (len(self.item) + 1) + self.raters)) < len(self.item):
             raise ValueError("a rater judged an item twice: keep the one answer that stands")
 
@@ -118,7 +119,7 @@ def agreement_with_others(ratings: Ratings, rng: np.random.Generator, resamples:
     """For each rater, in the order of `rater`: the mean, over items, of the share of the others who say the same."""
     if not len(ratings.item):
         return []
-    others = ratings.counts.sum(1)[ratings.items] - 1
+    others = ratings.counts.sum(1)[ratings.items] - 1  # (n,): without the rater
     same = (ratings.counts[ratings.items, ratings.values] - 1) / np.maximum(others, 1)
     shared, unit = others > 0, ratings.unit_of_item[ratings.items]
     rows = [shared & (ratings.raters == rater) for rater in range(int(ratings.raters.max()) + 1)]
@@ -153,6 +154,7 @@ def krippendorff_alpha(
         return lacking
     counts, unit = _shared(ratings)
     size = ratings.size
+    # (Q, V, V) ordered pairs of two different answers: an answer makes no pair with itself.
     pairs = counts[:, :, None] * (counts[:, None, :] - np.eye(size, dtype=np.int64))
     coincidences = (pairs / (counts.sum(1) - 1)[:, None, None]).reshape(-1, size * size)
     measure = _nominal if level == "nominal" else _ordinal
@@ -215,8 +217,10 @@ def _contingency(ratings: Ratings) -> tuple[csr_array, int, int]:
 
     Only pairs with enough common items, and what they judged.
     """
+    # By item, then rater: a pair of raters is always met in the same order, so its table is not split in two.
     order = np.lexsort((ratings.raters, ratings.items))
     item, rater, value = ratings.items[order], ratings.raters[order], ratings.values[order]
+    # Answers to one item are neighbours: all pairs d places apart, for each d up to the longest run.
     rows = [np.flatnonzero(item[d:] == item[:-d]) for d in range(1, int(ratings.counts.sum(1).max()))]
     a = np.concatenate(rows)
     b = a + np.repeat(np.arange(1, len(rows) + 1), [len(row) for row in rows])
@@ -247,6 +251,7 @@ def _kappas(tables: Floats) -> Floats:
     """(..., V, V) contingency tables -> (...) Cohen's kappa, NaN where it is not defined."""
     total = tables.sum((-2, -1))
     by_chance = (tables.sum(-1) * tables.sum(-2)).sum(-1)
+    # The maximum: a pair of raters may have no common item in a resample; its kappa is NaN below.
     observed = np.trace(tables, axis1=-2, axis2=-1) / np.maximum(total, 1)
     return _ratio(observed, by_chance, total**2)
 

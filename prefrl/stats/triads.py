@@ -49,15 +49,16 @@ def _triads(edges: Integers, rng: np.random.Generator) -> Integers:
     Each triad is one pair of edges that leave its lowest candidate, so a sample of such pairs samples triads evenly.
     """
     _, start, degree = np.unique(edges[:, 0], return_index=True, return_counts=True)
-    ends = np.cumsum(degree * (degree - 1) // 2)
+    ends = np.cumsum(degree * (degree - 1) // 2)  # pairs of edges that leave each candidate, counted through
     total = int(ends[-1]) if len(ends) else 0
     drawn = np.arange(total) if total <= MOST_TRIADS else rng.choice(total, MOST_TRIADS, replace=False)
     low = np.searchsorted(ends, drawn, side="right")
     nth = drawn - (ends - degree * (degree - 1) // 2)[low]
+    # The nth of the pairs (0, 1), (0, 2), (1, 2), (0, 3) ...: `second` starts at number second (second - 1) / 2.
     second = ((1 + np.sqrt(1 + 8 * nth)) // 2).astype(np.int64)
     ab, ac = start[low] + nth - second * (second - 1) // 2, start[low] + second
     width = int(edges.max(initial=0)) + 1
-    codes = edges[:, 0] * width + edges[:, 1]
+    codes = edges[:, 0] * width + edges[:, 1]  # one increasing number an edge, to look up bc in
     wanted = edges[ab, 1] * width + edges[ac, 1]
     bc = np.minimum(np.searchsorted(codes, wanted), max(len(codes) - 1, 0))
     return np.stack([ab, ac, bc], axis=1)[codes[bc] == wanted] if len(codes) else np.zeros((0, 3), np.int64)

@@ -90,6 +90,7 @@ class _Arrivals:
         self.kind = self.kind or one["body"]["type"]
         if one["body"]["type"] != self.kind:
             raise StoreError(f"a store that holds {self.kind}s cannot hold a {one['body']['type']} beside them")
+        # A digest in place of a prompt, of which there may be millions; JSON can bring in halves of surrogate pairs.
         context = hashlib.sha256(loaded.context.encode("utf-8", "surrogatepass")).digest()
         self.candidates[one["id"]] = _Candidate(one["id"], context)
 

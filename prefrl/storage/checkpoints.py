@@ -40,9 +40,10 @@ def load_state(folder: Path, name: str) -> State:
 def _split(value: Any, path: str, tensors: dict[str, torch.Tensor]) -> Any:
     """Move arrays out of a nested value, leaving {"$tensor": path} (or "$array" for NumPy) in their place."""
     if isinstance(value, torch.Tensor):
-        tensors[path] = value.detach().cpu().clone().contiguous()
+        tensors[path] = value.detach().cpu().clone().contiguous()  # safetensors refuses tensors that share memory
         return {"$tensor": path}
     if isinstance(value, np.ndarray):
+        # Reshaped, since ascontiguousarray makes a row of an array without axes.
         tensors[path] = torch.from_numpy(np.ascontiguousarray(value).copy()).reshape(value.shape)
         return {"$array": path}
     if isinstance(value, np.generic):

@@ -36,6 +36,7 @@ def own(folder: Path) -> FileLock:
     folder.mkdir(parents=True, exist_ok=True)
     lock, note = FileLock(folder / "owner.lock", timeout=0), folder / "owner.json"
     try:
+        # The lock ends with its process, however that ends; the note beside it only tells people who it is.
         lock.acquire()
     except Timeout:
         holder = note.read_text() if note.exists() else "unknown"
@@ -54,7 +55,7 @@ def own(folder: Path) -> FileLock:
 
 def disown(folder: Path, lock: FileLock) -> None:
     """Give up what `own` gave."""
-    (folder / "owner.json").unlink(missing_ok=True)
+    (folder / "owner.json").unlink(missing_ok=True)  # before the release, or it could be the next owner's
     lock.release()
 
 
@@ -116,7 +117,7 @@ def _sqlite(folder: Path, mode: str, **pool: int) -> sql.Engine:
     uri = f"{(folder / 'store.db').absolute().as_uri()}?mode={mode}"
 
     def connect() -> sqlite3.Connection:
-        return sqlite3.connect(uri, uri=True, check_same_thread=False)
+        return sqlite3.connect(uri, uri=True, check_same_thread=False)  # the pool lends it to one thread at a time
 
     return sql.create_engine("sqlite://", creator=connect, poolclass=sql.QueuePool, **pool)
 
@@ -149,6 +150,6 @@ def _lock_out_others(connection: Any, _: object) -> None:
             "pg_locks WHERE locktype = 'advisory' AND granted)"
         )
         others = cursor.fetchall()
-    connection.commit()
+    connection.commit()  # ends the transaction; the lock is the session's, and stays
     if not free:
         raise StoreError(f"another process is writing to this database: server process, address, since: {others}")

@@ -29,7 +29,7 @@ def write_file(path: Path, data: bytes) -> None:
         with os.fdopen(os.open(work, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            os.fsync(file.fileno())  # before the rename: a crash could leave the new name with nothing in it
         os.replace(work, path)
     except BaseException:
         work.unlink(missing_ok=True)
@@ -68,6 +68,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         yield work
         files = sorted(p for p in work.rglob("*") if p.is_file())
         hashes = {p.relative_to(work).as_posix(): _sha256(p) for p in files}
+        # The manifest comes last: what has one is whole.
         write_file(work / MANIFEST, json.dumps(hashes, indent=1).encode())
         _replace(path, work)
     except BaseException:
@@ -98,6 +99,7 @@ def check_free(path: Path) -> None:
 def _replace(path: Path, work: Path) -> None:
     """Put `work` in the place of `path`; what was there is only removed once that is done."""
     aside = _beside(path)
+    # A folder that holds something cannot be replaced by a rename, so the old one steps aside.
     if path.exists():
         os.rename(path, aside)
     os.rename(work, path)
@@ -107,6 +109,7 @@ def _replace(path: Path, work: Path) -> None:
 
 def _beside(path: Path) -> Path:
     """A hidden name in the same folder that nothing else has."""
+    # In the same folder: across file systems a rename is a copy, which can be cut short.
     return path.parent / f".{path.name}-{uuid.uuid4().hex[:12]}"
 
 

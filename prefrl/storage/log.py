@@ -61,7 +61,7 @@ class Transaction:
         for one in rows:
             if one["id"] not in numbers:
                 self.seq += 1
-                numbers[one["id"]] = self.seq
+                numbers[one["id"]] = self.seq  # noted at once: the same id may come twice among these rows
                 self.hash = chained(self.hash, one | {"seq": self.seq})
                 fresh.append(one | {"seq": self.seq, "hash": self.hash})
         if fresh:
@@ -77,7 +77,7 @@ class Transaction:
             with self.connection.begin_nested():
                 yield
         except BaseException:
-            self.seq, self.hash = seq, hash
+            self.seq, self.hash = seq, hash  # the chain goes on from the last event that is still there
             raise
 
     def _numbers(self, ids: Sequence[str]) -> dict[str, int]:
@@ -109,6 +109,7 @@ class EventLog:
         """Whether the disk was full when it was last written to."""
         self._turn = threading.RLock()
         self._head = (0, "")
+        # Before the database is touched: a second writer must not even open it.
         self._owner = engines.own(folder) if write else None
         self._opened: list[sql.Engine] = []
         try:
@@ -128,6 +129,7 @@ class EventLog:
         """Let go of the database, and of the right to write."""
         for engine in reversed(self._opened):  # the writer last: it empties the write-ahead log
             engine.dispose()
+        # Last of all: another process may write from here on.
         if self._owner is not None:
             engines.disown(self.folder, self._owner)
             self._owner = None
@@ -151,6 +153,7 @@ class EventLog:
                     yield at
                     if at.seq > self._head[0]:
                         _set_head(connection, at.seq, at.hash)
+                # Only after the commit: a transaction that failed leaves no trace in the chain.
                 self._head = at.seq, at.hash
             except OperationalError as error:
                 if not _says_full(error):

@@ -70,7 +70,7 @@ def verify_store(folder: Path) -> Verified:
 def repair_derived(folder: Path) -> None:
     """Write the derived tables again from the log. Raises `StoreError` where the log is damaged, or there is none."""
     require_store(folder)
-    lock = engines.own(folder)
+    lock = engines.own(folder)  # nobody may append while the tables are written again
     try:
         with _opened(folder) as connection:
             check_schema(connection, folder)
@@ -151,6 +151,7 @@ def _check_chain(connection: Connection, found: Verified) -> None:
 
 def _chain(connection: Connection, found: Verified) -> Iterator[dict[str, Any]]:
     """The events whose hashes are right, up to the first that is wrong; `found` says how it went."""
+    # Bodies as the text that was hashed: parsed and written again, damage could go unnoticed.
     before, raw = "", sql.type_coerce(event.c.body, sql.Text).label("raw")
     after = 0
     while True:

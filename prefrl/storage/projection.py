@@ -48,6 +48,7 @@ _ANSWERED = (
 
 def project(connection: Connection, events: Sequence[Event]) -> None:
     """Bring the derived tables up to date with events that were just appended, oldest first."""
+    # Kind by kind, for the sake of few statements: assignments and queries first, since answers are noted at them.
     for one in events:
         if one["kind"] not in (*ANSWERS, "retract", "candidate", "query"):
             _OTHERS[one["kind"]](connection, one)
@@ -86,6 +87,7 @@ def dump(connection: Connection) -> Iterator[str]:
 def all_events(connection: Connection, after: int = 0) -> Iterator[dict[str, Any]]:
     """The events after a number, oldest first, a few thousand in memory at a time."""
     while True:
+        # By number: an offset would count through all the rows before it, each time.
         some = sql.select(event).where(event.c.seq > after).order_by(event.c.seq).limit(5000)
         found = [dict(row._mapping) for row in connection.execute(some)]
         if not found:
@@ -145,6 +147,7 @@ def _answer(connection: Connection, events: Sequence[Event]) -> None:
         old = there.get(key)
         kind = RETRACTED if one["kind"] == "retract" else _sort(one)
         revision = (old["revision"] if old else 0) + (one["kind"] == "retract")
+        # Several words on one query may come together: the next one must see what this one left.
         there[key] = {"query": key[0], "labeler": key[1], "seq": one["seq"], "kind": kind, "revision": revision}
         change = counts.setdefault(key[0], {"b_id": key[0], "b_judged": 0, "b_incomparable": 0, "b_skipped": 0})
         for column, by in ((_column(old["kind"]) if old else None, -1), (_column(kind), 1)):

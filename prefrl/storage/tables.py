@@ -146,6 +146,7 @@ def chained(before: str, row: dict[str, Any]) -> str:
     """The hash of an event: sha256 over the hash before it and all that it says. "" is before the first."""
     fields = [row[name] for name in ("seq", "id", "kind", "subject", "actor", "at")]
     body = row["body"] if isinstance(row["body"], str) else canonical(row["body"])
+    # A JSON list keeps fields apart: joined as they are, the end of one could pass for the beginning of the next.
     return hashlib.sha256(json.dumps([before, *fields, body]).encode()).hexdigest()
 
 

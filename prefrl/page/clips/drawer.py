@@ -65,11 +65,11 @@ class _Child:
         with stream:
             for line in stream:
                 self.replies.put(line)
-        self.replies.put(None)
+        self.replies.put(None)  # the pipe has closed, so the process is gone
 
     def _err(self, stream: IO[str]) -> None:
         with stream:
-            while line := stream.readline(1000):
+            while line := stream.readline(1000):  # a line without an end must not fill the memory
                 self.words.append(line.rstrip())
 
 
@@ -140,7 +140,7 @@ class Drawer:
     def _end(self, child: _Child) -> None:
         """Kill a process with all that it started, and collect it."""
         with self._turn:
-            if self._child is not child:
+            if self._child is not child:  # `draw` and `close` may both come here: one of them ends it
                 return
             self._child = None
         _kill(child.process)

@@ -43,6 +43,7 @@ class Shelf:
                 status = entry.stat(follow_symlinks=False)
                 found.append((status.st_mtime, entry.name, status.st_size))
         with self._turn:
+            # The newest first, each put at the front: the oldest ends up there, and what was used since stays behind.
             for _, name, size in sorted(found, reverse=True):
                 if name not in self._sizes:
                     self._put(name, size)

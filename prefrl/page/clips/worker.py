@@ -87,7 +87,7 @@ def main(folder: str) -> None:
     artist = Artist(Path(folder))
     while True:
         outgoing.write(json.dumps(_reply(artist, json.loads(jobs.get()))) + "\n")
-        outgoing.flush()
+        outgoing.flush()  # the server waits for this line, with a time limit
 
 
 def _own_pipes() -> tuple[TextIO, TextIO]:
@@ -104,7 +104,7 @@ def _listen(incoming: TextIO, jobs: SimpleQueue[str]) -> None:
     """Hand on each line; when there are no more, the server is gone, and a job under way is for nobody."""
     for line in incoming:
         jobs.put(line)
-    os._exit(0)
+    os._exit(0)  # not sys.exit, which would end this thread alone
 
 
 def _reply(artist: Artist, job: dict[str, Any]) -> dict[str, Any]:
