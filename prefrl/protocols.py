@@ -150,30 +150,34 @@ class Attended(Protocol):
         """Close it, before the store is closed. Does nothing where it is not open."""
 
 
-class Store(Protocol[C]):
+class Judgements(Protocol[C]):
+    """What was judged, to be read: by fits and report cards. A store is one, and so is a file."""
+
+    @property
+    def sequence(self) -> int:
+        """The number of the newest event: the snapshot that a fit is made on."""
+
+    def judged(self, upto: int | None = None) -> list[Judged[C]]:
+        """Queries with their judgements, in the order in which they were given, up to a sequence number."""
+
+    def open_queries(self, labeler: str = "") -> list[Query[C]]:
+        """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
+
+    def gold(self, candidates: Sequence[C]) -> list[Floats]:
+        """The hidden values of candidates: for oracles and evaluation only."""
+
+
+class Store(Judgements[C], Protocol[C]):
     """Every behaviour asked about and every answer given, append-only."""
 
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
-
-    def open_queries(self, labeler: str = "") -> list[Query[C]]:
-        """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
 
     def answer(self, answers: Sequence[Answer]) -> None:
         """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""
-
-    def judged(self, upto: int | None = None) -> list[Judged[C]]:
-        """Queries with their judgements, in the order in which they were given, up to a sequence number."""
-
-    def gold(self, candidates: Sequence[C]) -> list[Floats]:
-        """The hidden values of candidates: for oracles and evaluation only."""
-
-    @property
-    def sequence(self) -> int:
-        """The number of the newest event: the snapshot that a fit is made on."""
 
     def counts(self) -> dict[str, int]:
         """Queries asked, answered, skipped."""
@@ -340,6 +344,7 @@ __all__ = [
     "ControlTask",
     "Environments",
     "Inputs",
+    "Judgements",
     "Labeler",
     "LabelerSettings",
     "Learner",

@@ -194,3 +194,19 @@ def test_a_policy_improves_on_a_reward_fitted_from_a_file(tmp_path: Path) -> Non
     assert np.isfinite(metrics["evaluate/learned"])
     assert np.isnan(metrics["evaluate/gold"])
     assert run.summary["gold_after"] is None
+
+
+def test_a_file_is_read_once_and_no_store_is_made_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = rows(tmp_path / "x.jsonl.gz", RANKED | {"labeler": "ann"})
+    read: list[Path] = []
+    whole = Path.open
+
+    def watched(self: Path, *arguments: Any, **named: Any) -> Any:
+        read.extend([self] if self == path else [])
+        return whole(self, *arguments, **named)
+
+    monkeypatch.setattr(Path, "open", watched)
+    monkeypatch.setattr("prefrl.store.Store.__init__", lambda *_, **__: pytest.fail("a store was opened"))
+    fitted, _ = fit_reward(texts_config(), path, tmp_path / "out")
+    assert fitted.metrics["judgements"] > 0
+    assert len(read) == 1

@@ -24,7 +24,7 @@ from prefrl.fit.pairs import compared
 from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.split import split
 from prefrl.judgements import Judged, person
-from prefrl.protocols import RewardModel, Store
+from prefrl.protocols import Judgements, RewardModel
 from prefrl.storage.files import DamagedError
 from prefrl.types import Candidate, Floats, Integers, Query, Response, Segment, gold_score
 
@@ -112,7 +112,12 @@ def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
 
 
 def of_run(
-    reward: RewardModel[Any], store: Store[Any], folder: Path, round: int, fitting: FittingSettings, discount: float
+    reward: RewardModel[Any],
+    store: Judgements[Any],
+    folder: Path,
+    round: int,
+    fitting: FittingSettings,
+    discount: float,
 ) -> Subject | None:
     """A run's reward model on what its newest fit left out; None where there is nothing to grade, or to grade on."""
     rows = [row for row in read_metrics(folder) if row["round"] <= round]
@@ -134,19 +139,19 @@ def of_run(
     )
 
 
-def judgements(store: Store[Any], held_out: float | None = None, upto: int | None = None) -> list[Judged[Any]]:
+def judgements(store: Judgements[Any], held_out: float | None = None, upto: int | None = None) -> list[Judged[Any]]:
     """What was judged in a store, with the gold that lies there; only what a fit left out, where a share is given."""
     judged = store.judged(upto)
     kept = split(judged, held_out) if held_out is not None and judged else np.ones(len(judged), bool)
     return [_with_gold(one, store) for one, keep in zip(judged, kept, strict=True) if keep]
 
 
-def _with_gold(one: Judged[Any], store: Store[Any]) -> Judged[Any]:
+def _with_gold(one: Judged[Any], store: Judgements[Any]) -> Judged[Any]:
     known = [replace(c, gold=_gold_of(c, store)) for c in one.query.candidates]
     return Judged(Query(tuple(known)), one.judgement)
 
 
-def _gold_of(candidate: Any, store: Store[Any]) -> Floats | None:
+def _gold_of(candidate: Any, store: Judgements[Any]) -> Floats | None:
     """None where no gold was ever filed; a file that is torn is an error."""
     try:
         return store.gold([candidate])[0]

@@ -1,6 +1,7 @@
 """Files of judgements, read whole or not at all: judged responses to prompts, and judged pairs of segments.
 
-A file is read twice: once to find every mistake, and once for its judgements, so that none of it need be kept.
+What goes into a store is read twice: once to find every mistake, and once for its judgements, so that none of it need
+be kept. What is wanted in memory is read once, and kept.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def read_judgements(path: Path, which: Which | None = None, layout: Layout | Non
     file names no labeler it is called after the content, so that reading it twice changes nothing. Labels of a
     "script" beside a human's are left out, and said to be, unless `which` asks for them.
     """
-    checked = check_file(path, which, layout)
+    checked = check_file(path, which, layout, keep=True)
     return Read(tuple(row.judged for row in checked.rows() if not isinstance(row.answer, Skip)), checked.notes)
 
 
@@ -52,10 +53,20 @@ class Checked:
     default: str
     """Whom its judgements are by where it names nobody."""
     notes: tuple[str, ...]
+    kept: tuple[Row, ...] | None = None
+    """Its rows as they were read, where they were to be kept."""
 
     def rows(self) -> Iterator[Row]:
-        """The answers that count, each with a labeler; read from the file again."""
+        """The answers that count, each with a labeler; read from the file again, unless they were kept."""
         seen: Counter[bytes] = Counter()
+        for row in (_numbered(one, self.default, seen) for one in self._again()):
+            if self.which.takes(row.answer.labeler) and self.which.split in ("", row.split):
+                yield row
+
+    def _again(self) -> Iterator[Row]:
+        if self.kept is not None:
+            yield from self.kept
+            return
         for _, parse in _parts(self.path, self.layout):
             try:
                 found = parse()
@@ -63,14 +74,12 @@ class Checked:
                 if not self.layout.skip_bad:
                     raise
                 continue
-            for row in (_numbered(one, self.default, seen) for one in found if isinstance(one, Row)):
-                if self.which.takes(row.answer.labeler) and self.which.split in ("", row.split):
-                    yield row
+            yield from (one for one in found if isinstance(one, Row))
 
 
-def check_file(path: Path, which: Which | None = None, layout: Layout | None = None) -> Checked:
-    """Read through a file, or a folder of files, keeping none of it; raises as `read_judgements` does."""
-    layout, which, found = layout or Layout(), which or Which(), _Found(f"file:{_digest(path)}")
+def check_file(path: Path, which: Which | None = None, layout: Layout | None = None, keep: bool = False) -> Checked:
+    """Read through a file, or a folder of files; raises as `read_judgements` does. `keep`: the rows, in memory."""
+    layout, which, found = layout or Layout(), which or Which(), _Found(keep)
     for place, parse in _parts(path, layout):
         try:
             parsed = parse()
@@ -79,6 +88,9 @@ def check_file(path: Path, which: Which | None = None, layout: Layout | None = N
         else:
             found.take(place, parsed)
     notes = found.told(path, layout.skip_bad)
+    # Only a file that leaves a labeler out is hashed: that goes through all of it once more.
+    default = f"file:{_digest(path)}" if found.nameless else ""
+    found.name(default)
     labelers = {person(who) for who, _ in found.counts}
     if not which.labelers and {HUMAN, SCRIPT} <= labelers:
         which = replace(which, labelers=tuple(labelers - {SCRIPT}))
@@ -88,16 +100,17 @@ def check_file(path: Path, which: Which | None = None, layout: Layout | None = N
         notes += _told(Counter({"label by a script (--labelers script reads it)": scripted}))
     if not any(which.takes(who) and which.split in ("", split) for who, split in found.counts):
         raise ValueError(f"{path}: {_nothing(found.counts, which)}")
-    return Checked(path, which, layout, found.default, notes)
+    return Checked(path, which, layout, default, notes, tuple(found.rows) if keep else None)
 
 
 @dataclass
 class _Found:
     """What a first reading of a file comes to: counts, and a few bytes for each row."""
 
-    default: str
+    keep: bool
+    rows: list[Row] = field(default_factory=list)
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """(labeler, split) -> answers."""
+    """(labeler, split) -> answers; "" for a labeler who is not named."""
     left_out: Counter[str] = field(default_factory=Counter)
     errors: list[str] = field(default_factory=list)
     mistakes: int = 0
@@ -114,13 +127,26 @@ class _Found:
     def take(self, place: str, parsed: Sequence[Row | str]) -> None:
         self.left_out.update(one for one in parsed if isinstance(one, str))
         for row in (one for one in parsed if isinstance(one, Row)):
-            self.counts[row.answer.labeler or self.default, row.split] += 1
-            key = _key(row, self.default)
+            self.rows += [row] * self.keep
+            self.counts[row.answer.labeler, row.split] += 1
+            key = _key(row, "")
             self.seen[key] += 1
             if self.seen[key] > 1:
                 self.repeated += 1
                 self.repeats += [f"{place} repeats {self.first[key]}"] * (len(self.repeats) < SHOWN_REPEATS)
             self.first.setdefault(key, place)
+
+    @property
+    def nameless(self) -> bool:
+        """Whether a row names no labeler."""
+        return any(not who for who, _ in self.counts)
+
+    def name(self, default: str) -> None:
+        """Call whoever is not named so."""
+        named: Counter[tuple[str, str]] = Counter()
+        for (who, split), count in self.counts.items():
+            named[who or default, split] += count
+        self.counts = named
 
     def told(self, path: Path, skip_bad: bool) -> tuple[str, ...]:
         """Notes for people. Raises `ValueError` for mistakes that may not be left out, and where nothing was found."""

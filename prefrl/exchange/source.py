@@ -5,28 +5,54 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from prefrl.exchange.bundles import is_bundle
+from prefrl.exchange.formats import read_judgements
 from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.judgements import Judged, person
+from prefrl.protocols import Judgements
+from prefrl.storage.files import DamagedError
 from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
-from prefrl.types import Segment
+from prefrl.types import Floats, Query, Segment
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """A `prefrl.protocols.Judgements` of a file: all of them there, and nothing beside them."""
+
+    of_file: tuple[Judged[Any], ...]
+
+    @property
+    def sequence(self) -> int:
+        return len(self.of_file)
+
+    def judged(self, upto: int | None = None) -> list[Judged[Any]]:
+        return list(self.of_file[:upto])
+
+    def open_queries(self, labeler: str = "") -> list[Query[Any]]:
+        return []
+
+    def gold(self, candidates: Sequence[Any]) -> list[Floats]:
+        raise DamagedError("a file of judgements holds no gold") from FileNotFoundError()
 
 
 class Opened(NamedTuple):
     """Judgements, ready to be read."""
 
-    store: Store[Any]
+    store: Judgements[Any]
     notes: tuple[str, ...]
     """What was left out of a file, for people."""
 
 
 @contextmanager
 def open_judgements(source: Path, task: Any, which: Which | None = None) -> Iterator[Opened]:
-    """The store of a folder, or a temporary one with the judgements of a file; to be read only.
+    """The store of a folder, or what a file holds; to be read only. A part of a store, or a bundle, gets a store of its
+    own for the time.
 
     `which` leaves out the other labelers' judgements, and the other parts of a file. Raises `ValueError` where nothing
     is left, or where candidates do not fit the task.
@@ -34,6 +60,9 @@ def open_judgements(source: Path, task: Any, which: Which | None = None) -> Iter
     with ExitStack() as stack:
         if source.is_dir() and not (which and (which.labelers or which.split)):
             opened = Opened(stack.enter_context(Store[Any](source, write=False)), ())
+        elif not source.is_dir() and not is_bundle(source):
+            read = read_judgements(source, which)
+            opened = Opened(InMemory(read.judged), read.notes)
         else:
             # Entered first, so removed last: the store in it is closed by then.
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))

@@ -18,7 +18,7 @@ from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
 from prefrl.judgements import Judged
-from prefrl.protocols import RewardModel, Store
+from prefrl.protocols import Judgements, RewardModel
 from prefrl.types import C, Fitted, Floats, Metrics
 
 
@@ -28,7 +28,7 @@ class NothingToFit(ValueError):
 
 def fit(
     reward: RewardModel[C],
-    store: Store[C],
+    store: Judgements[C],
     fitting: FittingSettings,
     rng: np.random.Generator,
     unjudged: Sequence[C] = (),
