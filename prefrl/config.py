@@ -9,6 +9,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
@@ -16,8 +17,8 @@ from pydantic_core import ErrorDetails
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
-from prefrl.protocols import LearnerSettings
-from prefrl.seeding import streams
+from prefrl.protocols import LearnerSettings, RewardModel, Task
+from prefrl.seeding import device_of, streams
 
 if TYPE_CHECKING:
     from prefrl.store import Store
@@ -70,6 +71,13 @@ class Config(Settings):
         """The learner's own."""
         return cast(LearnerSettings, self.learner).discount
 
+    def reward_model(self, task: Task, rng: np.random.Generator) -> RewardModel[Any]:
+        """The reward model, not fitted yet, on the learner's device."""
+        settings: Any = self.reward
+        model: RewardModel[Any] = settings.build(task, rng)
+        model.to(device_of(cast(LearnerSettings, self.learner).device))
+        return model
+
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:
         """Read a preset ("control/pendulum") or a YAML file, with `dotted.key=value` overrides.
@@ -99,11 +107,14 @@ class Config(Settings):
         from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
 
         if not isinstance(self.learner, LearnerSettings):
-            raise ConfigError(f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads")
+            raise ConfigError(
+                f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads, or no "
+                "`device`, which the reward model shares"
+            )
         rng = streams(self.seed, 0).build
         parts: Any = self  # the settings classes are known by kind only
         task = parts.task.build()
-        learner, reward = parts.learner.build(task, rng), parts.reward.build(task, rng)
+        learner, reward = parts.learner.build(task, rng), self.reward_model(task, rng)
         check_settings(self.fitting, not trainable(reward), task.kind, parts.select.candidates)
         return Loop(
             task=task,

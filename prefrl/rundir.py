@@ -189,8 +189,7 @@ class Saved:
 
     def reward(self, task: Task) -> RewardModel[Any]:
         """The reward model, on a task of the same kind."""
-        settings: Any = self.config.reward
-        model: RewardModel[Any] = settings.build(task, streams(self.config.seed, 0).build)
+        model = self.config.reward_model(task, streams(self.config.seed, 0).build)
         model.load(load_state(self.folder, "reward"))
         return model
 

@@ -151,7 +151,7 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
             raise ConfigError(
                 f"fitting.pseudo_labels: {source} holds no query without a judgement to label; set it to 0"
             )
-        reward = settings.reward.build(task, rng.build)
+        reward = config.reward_model(task, rng.build)
         fitted = fit(reward, store, config.fitting, rng.fit)
     save_reward(out, config, reward, fitted)
     return fitted, notes

@@ -26,6 +26,7 @@ from prefrl.components import ConfigError
 from prefrl.exchange.transcripts import prompt_messages, response_messages
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
+from prefrl.seeding import to_numpy
 from prefrl.types import Response
 
 Train = Literal["full", "lora", "head"]
@@ -84,14 +85,14 @@ class Backbone:
 
     def _padded_states(self, tokens: Tensor, lengths: Tensor) -> Tensor:
         tokens = tokens[:, : int(lengths.max())]
-        mask = torch.arange(tokens.shape[1]) < lengths[:, None]
+        mask = torch.arange(tokens.shape[1], device=tokens.device) < lengths[:, None]
         found = self.model(input_ids=tokens, attention_mask=mask.long())
         hidden: Tensor = found.logits if self.pool == "own" else found.last_hidden_state
         if self.pool == "own":
             return hidden
         if self.pool == "mean":
             return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]
-        return hidden[torch.arange(len(tokens)), lengths - 1 if self.pool == "last" else 0]
+        return hidden[torch.arange(len(tokens), device=tokens.device), lengths - 1 if self.pool == "last" else 0]
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
@@ -229,7 +230,7 @@ def digest(named: Mapping[str, Tensor]) -> str:
     found = hashlib.sha256()
     for name, value in named.items():
         found.update(name.encode())
-        found.update(value.detach().contiguous().view(torch.uint8).numpy().tobytes())
+        found.update(to_numpy(value.detach().contiguous().view(torch.uint8)).tobytes())
     return found.hexdigest()
 
 
