@@ -28,7 +28,7 @@ from prefrl.protocols import (
     Task,
     TaskSettings,
 )
-from prefrl.seeding import streams
+from prefrl.seeding import device_of, streams
 
 if TYPE_CHECKING:
     from prefrl.store import Store
@@ -135,12 +135,18 @@ class Config(Settings):
         return cast(LabelerSettings, self.labeler).build(task)
 
     def build_reward(self, task: Task, rng: np.random.Generator) -> RewardModel[Any]:
-        return cast(RewardSettings, self.reward).build(task, rng)
+        """Not fitted yet, on the learner's device."""
+        model = cast(RewardSettings, self.reward).build(task, rng)
+        model.to(device_of(cast(LearnerSettings, self.learner).device))
+        return model
 
     def build_learner(self, task: Task, rng: np.random.Generator) -> Learner[Any]:
-        """Raises `ConfigError` for a learner of another package that does not say its discount."""
+        """Raises `ConfigError` for a learner of another package that does not say its discount and device."""
         if not isinstance(self.learner, LearnerSettings):
-            raise ConfigError(f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads")
+            raise ConfigError(
+                f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads, or no "
+                "`device`, which the reward model shares"
+            )
         return self.learner.build(task, rng)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, runt
 import numpy as np
 
 from prefrl.judgements import Answer, Judged
+from prefrl.seeding import Device
 from prefrl.types import C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
 
 if TYPE_CHECKING:
@@ -209,6 +210,9 @@ class RewardModel(Protocol[C_contra]):
 
     def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 
+    def to(self, device: torch.device) -> None:
+        """Move everything to a device, once, before it is fitted or loaded: what is stacked lies there from then on."""
+
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates.
 
@@ -293,6 +297,10 @@ class Policy(Protocol[I_contra]):
 @runtime_checkable
 class LearnerSettings(Protocol):
     """What chooses a learner."""
+
+    @property
+    def device(self) -> Device:
+        """Where its policy computes; the reward model goes there too."""
 
     @property
     def discount(self) -> float:

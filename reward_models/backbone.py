@@ -26,6 +26,7 @@ from prefrl.components import ConfigError
 from prefrl.exchange.transcripts import prompt_messages, response_messages
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
+from prefrl.seeding import to_numpy
 from prefrl.types import Response
 
 Train = Literal["full", "lora", "head"]
@@ -85,7 +86,7 @@ class Backbone:
 
     def _padded_states(self, tokens: Tensor, lengths: Tensor) -> Tensor:
         tokens = tokens[:, : int(lengths.max())]  # a part needs no more columns than its longest row
-        mask = torch.arange(tokens.shape[1]) < lengths[:, None]
+        mask = torch.arange(tokens.shape[1], device=tokens.device) < lengths[:, None]
         found = self.model(input_ids=tokens, attention_mask=mask.long())
         # Of a classifier whose last layer is the identity, the logits (n, d) are what that layer was given.
         hidden: Tensor = found.logits if self.pool == "own" else found.last_hidden_state
@@ -94,7 +95,7 @@ class Backbone:
         if self.pool == "mean":
             return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]  # (n, L, d) -> (n, d), padding left out
         # By length, not by looking for padding: where padding is the end token, a search finds the wrong place.
-        return hidden[torch.arange(len(tokens)), lengths - 1 if self.pool == "last" else 0]
+        return hidden[torch.arange(len(tokens), device=tokens.device), lengths - 1 if self.pool == "last" else 0]
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
@@ -238,7 +239,7 @@ def digest(named: Mapping[str, Tensor]) -> str:
     for name, value in named.items():
         found.update(name.encode())
         # As bytes, since NumPy has no bfloat16.
-        found.update(value.detach().contiguous().view(torch.uint8).numpy().tobytes())
+        found.update(to_numpy(value.detach().contiguous().view(torch.uint8)).tobytes())
     return found.hexdigest()
 
 

@@ -18,7 +18,7 @@ from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
 from prefrl.reward_models.steps import CACHED, StepReward, control, each_input, uniform
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 
 
 class CNNSettings(Settings):
@@ -44,7 +44,7 @@ class CNNSettings(Settings):
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
         found = control(task, self.kind)
         _check(self.image, found)
-        network = CNN(self, found.action_size, torch.Generator().manual_seed(draw_seed(rng)))
+        network = CNN(self, found.action_size, generator(rng))
         return StepReward(network, found, self.gain, self.combine, self.measure)
 
     def measure(self, steps: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,10 +52,10 @@ class CNNSettings(Settings):
         pixels = math.prod(self.image)
         action_mean, action_std = each_input(steps[:, pixels:])
         if self.brightest is not None:
-            mean, std = torch.tensor(0.0), torch.tensor(self.brightest)
+            mean, std = steps.new_tensor(0.0), steps.new_tensor(self.brightest)
         else:
             std, mean = torch.std_mean(steps[:, :pixels], correction=0)
-        std = std if std > 1e-6 else torch.tensor(1.0)  # pictures of one colour
+        std = std if std > 1e-6 else steps.new_tensor(1.0)  # pictures of one colour
         return torch.cat([mean.expand(pixels), action_mean]), torch.cat([std.expand(pixels), action_std])
 
 
@@ -64,15 +64,15 @@ class CNN:
 
     memory, first = 1, None
 
-    def __init__(self, settings: CNNSettings, actions: int, generator: torch.Generator) -> None:
+    def __init__(self, settings: CNNSettings, actions: int, order: torch.Generator) -> None:
         self.members, self.most, self._image = settings.members, CACHED // settings.members, settings.image
         height, width, channels = settings.image
         pairs = list(pairwise((channels, *settings.channels)))
-        self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, generator) for i, o in pairs]
-        self._biases = [uniform((self.members * o,), 9 * i, generator) for i, o in pairs]
+        self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, order) for i, o in pairs]
+        self._biases = [uniform((self.members * o,), 9 * i, order) for i, o in pairs]
         halved = (-(-size // 2 ** len(pairs)) for size in (height, width))
         found = math.prod(halved) * settings.channels[-1]
-        self._head = MLP(self.members, (found + actions, *settings.hidden, 1), "relu", generator)
+        self._head = MLP(self.members, (found + actions, *settings.hidden, 1), "relu", order)
 
     def named(self) -> Mapping[str, Tensor]:
         filters = {f"filter_{i}": w for i, w in enumerate(self._filters)}

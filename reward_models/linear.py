@@ -15,6 +15,7 @@ from prefrl.components import ConfigError, Settings, feature_functions, suggest
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.steps import CACHED, Describe, StepReward, control, input_width
+from prefrl.seeding import to_numpy
 from prefrl.types import Floats
 
 STEPS = 200
@@ -94,7 +95,8 @@ class Linear:
         """(..., I) -> (..., d)."""
         if not self._quadratic:
             return inputs
-        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1])  # each product once, squares among them
+        # each product once, squares among them
+        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1], device=inputs.device)
         return torch.cat([inputs, inputs[..., i] * inputs[..., j] - (i == j).float()], -1)
 
     def solve(self, inputs: Tensor, counts: Tensor, loss: Loss) -> None:
@@ -124,16 +126,16 @@ def maximum(design: Tensor, loss: Loss, prior_std: float) -> tuple[Tensor, Tenso
         return loss(design @ w) + 0.5 * (w / prior_std).square().sum()
 
     def value_and_gradient(at: Floats) -> tuple[float, Floats]:
-        w = torch.tensor(at, requires_grad=True)
+        w = torch.tensor(at, device=design.device, requires_grad=True)
         with torch.enable_grad():
             value = objective(w)
             (gradient,) = torch.autograd.grad(value, w)
-        return float(value), gradient.numpy()
+        return float(value), to_numpy(gradient)
 
     def hessian(at: Floats) -> Floats:
         with torch.enable_grad():
-            found: Tensor = torch.autograd.functional.hessian(objective, torch.tensor(at))  # type: ignore[no-untyped-call]
-        return found.numpy()
+            found: Tensor = torch.autograd.functional.hessian(objective, torch.tensor(at, device=design.device))  # type: ignore[no-untyped-call]
+        return to_numpy(found)
 
     options: Any = {"gtol": 1e-6, "maxiter": STEPS}
     start = np.zeros(design.shape[1])
@@ -145,4 +147,5 @@ def maximum(design: Tensor, loss: Loss, prior_std: float) -> tuple[Tensor, Tenso
             f"the linear reward's most probable weights were not found in {STEPS} Newton steps ({found.message}); "
             "make reward.prior_std smaller"
         )
-    return torch.tensor(found.x), torch.tensor(found.hess)
+    w, curvature = (torch.tensor(x, device=design.device) for x in (found.x, found.hess))
+    return w, curvature

@@ -16,7 +16,7 @@ from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.perceptron import Activation, perceptrons
 from prefrl.reward_models.steps import StepReward, control, uniform
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 
 
 class MLPSettings(Settings):
@@ -36,9 +36,8 @@ class MLPSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         found = control(task, self.kind)
-        generator = torch.Generator().manual_seed(draw_seed(rng))
         sizes = (found.observation_size + found.action_size, *self.hidden, 1)
-        return StepReward(MLP(self.members, sizes, self.activation, generator), found, self.gain, self.combine)
+        return StepReward(MLP(self.members, sizes, self.activation, generator(rng)), found, self.gain, self.combine)
 
 
 class MLP:
@@ -46,13 +45,11 @@ class MLP:
 
     memory, most = 1, 1_000_000  # it divides them itself, by its widths
 
-    def __init__(
-        self, members: int, sizes: tuple[int, ...], activation: Activation, generator: torch.Generator
-    ) -> None:
+    def __init__(self, members: int, sizes: tuple[int, ...], activation: Activation, order: torch.Generator) -> None:
         pairs = list(pairwise(sizes))
         self.members, self._activation = members, activation
-        self.weights = [uniform((members, i, o), i, generator) for i, o in pairs]
-        self.biases = [uniform((members, 1, o), i, generator) for i, o in pairs]
+        self.weights = [uniform((members, i, o), i, order) for i, o in pairs]
+        self.biases = [uniform((members, 1, o), i, order) for i, o in pairs]
 
     def named(self) -> Mapping[str, Tensor]:
         weights = {f"weight_{i}": w for i, w in enumerate(self.weights)}

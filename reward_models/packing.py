@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import embedding, scaled_dot_product_attention
 from transformers import AttentionInterface, PreTrainedModel
 
+from prefrl.seeding import to_numpy
 from prefrl.types import Integers
 
 ATTENTION = "prefrl_packed"
@@ -40,14 +41,14 @@ class Packed:
     @property
     def ends(self) -> Tensor:
         """(N,) int64: which of the P is each row's last token."""
-        return self.rows[torch.arange(len(self.rows)), self.lengths - 1]
+        return self.rows[torch.arange(len(self.rows), device=self.rows.device), self.lengths - 1]
 
 
 def pack(tokens: Tensor, lengths: Tensor) -> Packed:
     """Rows (N, L) with their lengths (N,), right-padded with anything."""
-    counts, width = lengths.numpy(), int(lengths.max())
+    counts, width = to_numpy(lengths), int(lengths.max())
     real = np.arange(width) < counts[:, None]
-    values = np.where(real, tokens.numpy()[:, :width], -1)  # no token, so that what pads is like nothing real
+    values = np.where(real, to_numpy(tokens)[:, :width], -1)  # no token, so that what pads is like nothing real
     order = np.lexsort(values.T[::-1])  # lexsort's last key counts most, so the first token must come last
     source = np.empty_like(values)
     # (N, L): of the rows that begin alike up to a place, the one that is computed for all of them.
@@ -56,7 +57,8 @@ def pack(tokens: Tensor, lengths: Tensor) -> Packed:
     numbers = np.cumsum(fresh).reshape(fresh.shape) - 1  # (N, L): what a fresh place is counted as among the P
     rows = np.where(real, np.take_along_axis(numbers, source, 0), 0)
     origin = np.flatnonzero(fresh)
-    return Packed(*map(torch.from_numpy, (values[fresh], origin % width, rows, origin, counts)))
+    arrays = (values[fresh], origin % width, rows, origin, counts)
+    return Packed(*(torch.from_numpy(x).to(tokens.device) for x in arrays))
 
 
 def _first_alike(values: Integers) -> Integers:
@@ -140,7 +142,7 @@ def _last_layer(layer: Any, x: Tensor, turns: tuple[Tensor, Tensor], packed: Pac
 def _attend_from_ends(q: Tensor, k: Tensor, v: Tensor, packed: Packed, scaling: float) -> Tensor:
     """One query (heads, D) a row: (N, heads, D), (P, groups, D), (P, groups, D) -> (N, heads x D)."""
     # No causal mask here, since the last token sees its whole row: padding is masked instead.
-    real = torch.arange(packed.rows.shape[1]) < packed.lengths[:, None]
+    real = torch.arange(packed.rows.shape[1], device=packed.rows.device) < packed.lengths[:, None]
     with torch.autocast(q.device.type, enabled=False):
         keys, values, grouped = _spread(k, packed.rows), _spread(v, packed.rows), q.shape[1] != k.shape[1]
         found = scaled_dot_product_attention(

@@ -15,7 +15,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.protocols import Task
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.steps import CACHED, StepReward, control, uniform
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 
 
 class GRUSettings(Settings):
@@ -43,7 +43,7 @@ class GRU:
     """A `Network`: E gated recurrent units, and a linear output of each step's state."""
 
     def __init__(self, settings: GRUSettings, inputs: int, memory: int, rng: np.random.Generator) -> None:
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        order = generator(rng)
         self.members, self.memory, width = settings.members, memory, settings.width
         self.most = CACHED // self.members
         shapes = {
@@ -54,7 +54,7 @@ class GRU:
             "output_weight": (width, 1),
             "output_bias": (1, 1),
         }
-        self._p = {n: uniform((settings.members, *s), width, generator) for n, s in shapes.items()}
+        self._p = {n: uniform((settings.members, *s), width, order) for n, s in shapes.items()}
 
     def named(self) -> Mapping[str, Tensor]:
         return self._p
@@ -129,19 +129,19 @@ class PreferenceTransformer:
     def __init__(
         self, settings: PreferenceTransformerSettings, inputs: int, memory: int, rng: np.random.Generator
     ) -> None:
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        order = generator(rng)
         self.members, self.memory, self.most = settings.members, memory, CACHED // settings.members
         self._heads, self._layers, self._weighted = settings.heads, settings.layers, settings.preference_attention
         width = settings.width
-        self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, generator)}
-        self._linear("input", inputs, width, generator)
+        self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, order)}
+        self._linear("input", inputs, width, order)
         for i in range(settings.layers):
             for name, o, n in (("qkv", width, 3 * width), ("mix", width, width), ("up", width, 4 * width)):
-                self._linear(f"layer_{i}_{name}", o, n, generator)
-            self._linear(f"layer_{i}_down", 4 * width, width, generator)
-        self._linear("output", width, 1, generator)
+                self._linear(f"layer_{i}_{name}", o, n, order)
+            self._linear(f"layer_{i}_down", 4 * width, width, order)
+        self._linear("output", width, 1, order)
         if self._weighted:
-            self._linear("attend", width, 2 * width, generator)
+            self._linear("attend", width, 2 * width, order)
 
     def named(self) -> Mapping[str, Tensor]:
         return self._p
@@ -165,9 +165,9 @@ class PreferenceTransformer:
         # The worths (E, B, T, 1) take the place of values: what comes out is their weighted mean, on their own scale.
         return scaled_dot_product_attention(q, k, worth, is_causal=True)[..., 0]
 
-    def _linear(self, name: str, fan_in: int, fan_out: int, generator: torch.Generator) -> None:
+    def _linear(self, name: str, fan_in: int, fan_out: int, order: torch.Generator) -> None:
         """Each layer norm's own gain and shift would be part of the linear layer behind it, and are left to it."""
-        self._p[f"{name}_weight"] = uniform((self.members, fan_in, fan_out), fan_in, generator)
+        self._p[f"{name}_weight"] = uniform((self.members, fan_in, fan_out), fan_in, order)
         self._p[f"{name}_bias"] = torch.nn.Parameter(torch.zeros(self.members, 1, fan_out))
 
     def _apply(self, name: str, x: Tensor) -> Tensor:

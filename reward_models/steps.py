@@ -16,6 +16,7 @@ from torch import Tensor
 from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Task
 from prefrl.reward_models.ensemble import Ensemble, combine
+from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Segment, State
 
 CACHED = 4096
@@ -74,9 +75,9 @@ def input_width(task: ControlTask, describe: Describe | None) -> int:
     return int(found.shape[1])
 
 
-def uniform(shape: tuple[int, ...], fan_in: int, generator: torch.Generator) -> torch.nn.Parameter:
+def uniform(shape: tuple[int, ...], fan_in: int, order: torch.Generator) -> torch.nn.Parameter:
     """torch.nn.Linear's default start: uniform within 1 / sqrt(fan in)."""
-    return torch.nn.Parameter((torch.rand(shape, generator=generator) * 2 - 1) / math.sqrt(fan_in))
+    return torch.nn.Parameter((torch.rand(shape, generator=order) * 2 - 1) / math.sqrt(fan_in))
 
 
 class StepReward:
@@ -120,13 +121,18 @@ class StepReward:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return [p for p in self.network.named().values() if isinstance(p, torch.nn.Parameter)]
 
+    def to(self, device: torch.device) -> None:
+        for tensor in self._saved().values():
+            tensor.data = tensor.data.to(device)
+
     def stack(self, candidates: Sequence[Segment]) -> Mapping[str, Tensor]:
         """Normalised inputs (N, T, I) and mask (N, T). Begins a fit: mean and std are measured here, and stay.
 
         Raises ValueError for a segment of other sizes than the task's.
         """
-        steps, lengths = self._steps(candidates), torch.tensor([len(c) for c in candidates])
-        mask = torch.arange(int(lengths.max())) < lengths[:, None]
+        steps = self._steps(candidates)
+        lengths = torch.tensor([len(c) for c in candidates], device=steps.device)
+        mask = torch.arange(max(map(len, candidates)), device=steps.device) < lengths[:, None]
         self._rebase(steps)  # first: it measures what is then normalised in place
         self._normalise_(steps)
         if mask.all():
@@ -172,7 +178,8 @@ class StepReward:
         # Over steps, not candidates, for a policy is paid by the step. The clamp is for a reward that never varies.
         self._shift, self._scale = outputs.mean(1), outputs.std(1, correction=0).clamp(min=1e-6)
         self._temperature, self._fits = 1.0, self._fits + 1
-        return torch.from_numpy(_sums(outputs.numpy(), np.flatnonzero(begins))) * self._gain
+        sums = _sums(to_numpy(outputs), np.flatnonzero(begins))
+        return torch.from_numpy(sums).to(outputs.device) * self._gain
 
     def calibrate(self, temperature: float) -> None:
         self._temperature = temperature
@@ -200,7 +207,7 @@ class StepReward:
             )
         marks[:, :1] = True
         steps = self._normalise_(self._inputs(observations, actions))  # in place on the copy that _inputs makes
-        found = self._member_rewards(steps, marks.ravel()).numpy()
+        found = to_numpy(self._member_rewards(steps, marks.ravel()))
         return combine(found, self._ensemble, self._fits).reshape(shape)
 
     def features(self, candidates: Sequence[Segment]) -> Floats:
@@ -211,8 +218,7 @@ class StepReward:
         steps = self._steps(candidates)
         mean, std = (self._input_mean, self._input_std) if self.fitted else self._measure(steps)
         parts = torch.split((steps - mean) / std, [len(c) for c in candidates])
-        found: Floats = torch.stack([torch.cat([p.mean(0), p.std(0, correction=0)]) for p in parts]).numpy()
-        return found
+        return to_numpy(torch.stack([torch.cat([p.mean(0), p.std(0, correction=0)]) for p in parts]))
 
     def state(self) -> State:
         tensors = {name: x.detach().clone() for name, x in self._saved().items()}
@@ -239,8 +245,7 @@ class StepReward:
         """(E, S): `what` of the steps of all candidates, one after another."""
         steps, begins = self._steps(candidates), np.zeros(sum(len(c) for c in candidates), bool)
         begins[_starts(candidates)] = True
-        found: Floats = what(self._normalise_(steps), begins).numpy()
-        return found
+        return to_numpy(what(self._normalise_(steps), begins))
 
     def _member_rewards(self, inputs: Tensor, begins: np.ndarray) -> Tensor:
         return (self._outputs(inputs, begins) - self._shift[:, None]) / self._scale[:, None]
@@ -281,33 +286,34 @@ class StepReward:
         self._input_mean, self._input_std = mean, std
 
     def _steps(self, candidates: Sequence[Segment]) -> Tensor:
-        """(S, I): the steps of all candidates, one after another."""
+        """(S, I): the steps of all candidates, one after another, on the model's device."""
         if not len(candidates):
             raise ValueError("a reward model scores at least one segment at a time, got none")
         for one in candidates:
             self._check(one.observations, one.actions)
         # NumPy writes into torch's memory; "unsafe" lets float64 and integers be narrowed to float32.
         steps = torch.empty(sum(len(c) for c in candidates), sum(self._sizes))
-        inside = steps.numpy()
+        inside = to_numpy(steps)
         np.concatenate([c.observations for c in candidates], out=inside[:, : self._sizes[0]], casting="unsafe")
         np.concatenate([c.actions for c in candidates], out=inside[:, self._sizes[0] :], casting="unsafe")
         return self._described(steps)
 
     def _inputs(self, observations: Floats, actions: Floats) -> Tensor:
-        """(B, T, O) and (B, T, A) -> (B T, I)."""
+        """(B, T, O) and (B, T, A) -> (B T, I), on the model's device."""
         self._check(observations, actions)
         both = np.concatenate([observations, actions], -1, dtype=np.float32, casting="unsafe")
         return self._described(torch.from_numpy(both).flatten(0, 1))
 
     def _described(self, steps: Tensor) -> Tensor:
         """(S, O + A) -> (S, I): hand-made features in their place, where there are any."""
+        device = self._input_mean.device
         if self._describe is None:
-            return steps
-        observations, actions = np.split(steps.numpy(), self._sizes[:1], 1)
+            return steps.to(device)
+        observations, actions = np.split(to_numpy(steps), self._sizes[:1], 1)
         found = np.array(self._describe(observations, actions), np.float32)
         if found.shape != (wanted := (len(steps), len(self._input_mean))):
             raise ValueError(f"hand-made features of {len(steps)} steps must be of shape {wanted}, got {found.shape}")
-        return torch.from_numpy(found)
+        return torch.from_numpy(found).to(device)
 
     def _check(self, observations: Floats, actions: Floats) -> None:
         if (observations.shape[-1], actions.shape[-1]) != self._sizes or not observations.size:
@@ -322,7 +328,8 @@ class StepReward:
 
 def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     """The mean and std of each input; a constant has std 1."""
-    each = torch.full((1, len(steps)), 1 / len(steps))  # products are several times faster than mean and std over rows
+    # Products are several times faster than mean and std over rows.
+    each = torch.full((1, len(steps)), 1 / len(steps), device=steps.device)
     mean = (each @ steps)[0]
     squares = ((piece - mean).square_() for piece in torch.split(steps, CACHED))
     variance = sum((each[:, : len(piece)] @ piece)[0] for piece in squares)
@@ -343,8 +350,8 @@ def _flat(inputs: Tensor, mask: Tensor) -> tuple[Tensor, np.ndarray]:
     begins = torch.zeros_like(real)
     begins[:, 0] = True  # each candidate is a piece of its own, whatever came before it in its episode
     if real.all():
-        return inputs.flatten(0, 1), begins.flatten().numpy()
-    return inputs[real], begins[real].numpy()
+        return inputs.flatten(0, 1), to_numpy(begins.flatten())
+    return inputs[real], to_numpy(begins[real])
 
 
 def _starts(candidates: Sequence[Segment]) -> np.ndarray:
@@ -373,9 +380,11 @@ def looking_back(
         at = np.arange(length[part].max())  # (L,): columns of this chunk of rows
         steps = np.minimum(start[part, None] + at, len(inputs) - 1)  # what lies beyond a row's end is not taken
         taken = (at < length[part, None]) & (at >= (length - new)[part, None])  # within its row, and new there
-        found.append(outputs(inputs[torch.from_numpy(steps)])[:, torch.from_numpy(taken)])
+        shown, fresh = (torch.from_numpy(x).to(inputs.device) for x in (steps, taken))
+        found.append(outputs(inputs[shown])[:, fresh])
         places.append(steps[taken])
-    return torch.cat(found, 1)[:, torch.from_numpy(np.concatenate(places).argsort())]  # back into the order of steps
+    order = torch.from_numpy(np.concatenate(places).argsort()).to(inputs.device)  # back into the order of steps
+    return torch.cat(found, 1)[:, order]
 
 
 def windows(begins: np.ndarray, memory: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,10 +14,11 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from prefrl.components import ConfigError, Settings
+from prefrl.policies.language import pad_right
 from prefrl.protocols import Task, TextTask
 from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
 from prefrl.reward_models.ensemble import Ensemble, combine
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator, to_numpy
 from prefrl.types import Floats, Response, State
 
 CHUNK = 128
@@ -84,9 +85,9 @@ class TransformerReward:
 
     def __init__(self, settings: TransformerSettings, backbone: Backbone, rng: np.random.Generator) -> None:
         self._settings, self.backbone = settings, backbone
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        drawn = torch.randn(settings.members, backbone.width, generator=generator(rng))
         # Over sqrt(d + 1), so that scores do not start further apart the wider the backbone is.
-        heads = torch.randn(settings.members, backbone.width, generator=generator) / math.sqrt(backbone.width + 1)
+        heads = drawn / math.sqrt(backbone.width + 1)
         self._heads, self._bias = torch.nn.Parameter(heads), torch.nn.Parameter(torch.zeros(settings.members))
         self._shift, self._scale = torch.zeros(settings.members), torch.ones(settings.members)
         self._fits, self._temperature = 0, 1.0
@@ -108,6 +109,11 @@ class TransformerReward:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return [*self._trained.values(), self._heads, self._bias]
 
+    def to(self, device: torch.device) -> None:
+        self.backbone.model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
+        for tensor in (self._heads, self._bias, self._shift, self._scale):
+            tensor.data = tensor.data.to(device)
+
     def stack(self, candidates: Sequence[Response]) -> Mapping[str, Tensor]:
         """tokens (N, L) and lengths (N,); where only heads are trained, the backbone's features (N, d) at once.
 
@@ -115,7 +121,7 @@ class TransformerReward:
         """
         if self._settings.train == "head":
             return {"features": self._in_chunks(candidates)}
-        return _padded(self.backbone.rows(candidates))
+        return self._padded(self.backbone.rows(candidates))
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         features = stacked["features"] if "features" in stacked else self._features(stacked)
@@ -139,7 +145,7 @@ class TransformerReward:
         return raw
 
     def member_scores(self, candidates: Sequence[Response]) -> Floats:
-        shift, scale = self._shift.numpy()[:, None], self._scale.numpy()[:, None]
+        shift, scale = to_numpy(self._shift)[:, None], to_numpy(self._scale)[:, None]
         found: Floats = (self._scores_of(candidates) - shift) / scale
         return found
 
@@ -148,8 +154,7 @@ class TransformerReward:
 
     def features(self, candidates: Sequence[Response]) -> Floats:
         """(N, d): what the heads see, of a causal model its state at the last token."""
-        found: Floats = self._in_chunks(candidates).numpy()
-        return found
+        return to_numpy(self._in_chunks(candidates))
 
     def state(self) -> State:
         """What a fit changes; of what it does not change, only a digest."""
@@ -169,7 +174,7 @@ class TransformerReward:
             raise ValueError("reward model: its backbone's frozen weights are others than those it was fitted on")
         for name, parameter in own.items():
             parameter.copy_(found[name])
-        self._shift, self._scale = state["shift"].clone(), state["scale"].clone()
+        self._shift, self._scale = (state[n].to(self._heads.device, copy=True) for n in ("shift", "scale"))
         self._fits, self._temperature = int(state["fits"]), float(state["temperature"])
 
     @torch.no_grad()
@@ -193,14 +198,15 @@ class TransformerReward:
 
     def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
         """(N, d) float32."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+        with torch.autocast(
+            stacked["tokens"].device.type, torch.bfloat16, enabled=self._settings.precision == "bfloat16"
+        ):
             # Heads and scores in float32: bfloat16 near 1 moves in steps of 1/128, which would make ties.
             return self.backbone.states(stacked["tokens"], stacked["lengths"]).float()
 
     @torch.no_grad()
     def _scores_of(self, candidates: Sequence[Response]) -> Floats:
-        found: Floats = self.scores({"features": self._in_chunks(candidates)}).numpy()
-        return found
+        return to_numpy(self.scores({"features": self._in_chunks(candidates)}))
 
     @torch.no_grad()
     def _in_chunks(self, candidates: Sequence[Response]) -> Tensor:
@@ -208,15 +214,13 @@ class TransformerReward:
         rows = self.backbone.rows(candidates)
         order = sorted(range(len(rows)), key=lambda i: len(rows[i]))  # like lengths share a chunk
         chunks = [order[i : i + CHUNK] for i in range(0, len(rows), CHUNK)]
-        features = torch.cat([self._features(_padded([rows[i] for i in chunk])) for chunk in chunks])
-        return features[torch.tensor(order).argsort()]
+        features = torch.cat([self._features(self._padded([rows[i] for i in chunk])) for chunk in chunks])
+        return features[torch.tensor(order, device=features.device).argsort()]
 
-
-def _padded(rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
-    """Right-padded with 0, which is a valid id; lengths say what is real."""
-    width = max(map(len, rows))
-    tokens = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows])
-    return {"tokens": tokens, "lengths": torch.tensor([len(row) for row in rows])}
+    def _padded(self, rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
+        """Right-padded with 0, which is a valid id; lengths say what is real."""
+        tokens, lengths = pad_right(rows, self._heads.device)
+        return {"tokens": tokens, "lengths": lengths}
 
 
 def _text(task: Task) -> TextTask:

@@ -58,6 +58,8 @@ class LinearReward:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return ()
 
+    def to(self, device: torch.device) -> None: ...
+
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: object) -> torch.Tensor:
         raise NotImplementedError
 

@@ -1,7 +1,11 @@
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import yaml
+from other_device import ELSEWHERE, both
 
 from prefrl import Config
 from prefrl.components import TABLE, ConfigError, Settings, kinds, settings_class
@@ -185,3 +189,17 @@ def test_a_missing_extra_names_the_command_that_installs_it(monkeypatch: pytest.
     monkeypatch.setattr("prefrl.components.import_module", absent)
     with pytest.raises(ConfigError, match=r"pip install 'prefrl\[control\]'"):
         settings_class("learners", "sb3")
+
+
+def test_the_reward_model_follows_the_learner_to_its_device() -> None:
+    config = Config.load(TOY)
+
+    def devices(device: torch.device) -> set[str]:
+        learner: Any = config.learner.model_copy(update={"device": device})
+        task: Any = config.task
+        moved = config.model_copy(update={"learner": learner})
+        model = moved.build_reward(task.build(), np.random.default_rng(0))
+        tensors = [x for x in model.state().values() if isinstance(x, torch.Tensor)]
+        return {x.device.type for x in (*tensors, *model.parameters())}
+
+    assert both(devices) == ({"cpu"}, {ELSEWHERE.type})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -41,6 +42,16 @@ def test_no_imports_go_in_a_circle() -> None:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(reversed(error.args[1])))
+
+
+def test_nothing_that_computes_names_a_device() -> None:
+    """Tensors are made where the policy or the reward model is; `prefrl/seeding.py` alone says where that is."""
+    rooms = ("fit", "policies", "improve", "reward_models")
+    files = [path for room in rooms for path in (ROOT / "prefrl" / room).glob("*.py")]
+    assert len(files) > 30
+    named = re.compile(r"""["'](cpu|cuda)|\.(cpu|cuda)\(\)|\.numpy\(\)""")
+    found = [f"{path.parent.name}/{path.name}" for path in files if named.search(path.read_text("utf-8"))]
+    assert found == []
 
 
 def test_few_files_lie_flat_at_the_root_of_the_package() -> None:

@@ -19,7 +19,7 @@ from prefrl.fit.noise import Discriminator, flipped
 from prefrl.fit.settings import FittingSettings, check_solved
 from prefrl.fit.terms import Terms
 from prefrl.protocols import RewardModel
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 from prefrl.types import C
 
 RATE = 0.05
@@ -84,10 +84,10 @@ class Problem(Generic[C]):
 
     def _unjudged(self, part: Terms, order: torch.Generator) -> Tensor:
         if not self.fitting.pseudo_labels:
-            return torch.zeros(0, 2, dtype=torch.int64)
+            return part.labeler.new_zeros(0, 2)
         judgements = torch.cat([part.choices.judgement, part.ratings.judgement])
         count = UNJUDGED * len(set(judgements.tolist()))
-        return semi.pairs(self.candidates[self.judged :], self.judged, count, order)
+        return semi.pairs(self.candidates[self.judged :], self.judged, count, order).to(part.labeler.device)
 
 
 def optimise(problem: Problem[C], rng: np.random.Generator) -> int:
@@ -114,7 +114,7 @@ class _Descent(Generic[C]):
         ]
         groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, self.fitting.learning_rate, fused=True)
-        self.order = torch.Generator().manual_seed(draw_seed(rng))
+        self.order = generator(rng)
         self.discriminator = Discriminator()
 
     def run(self) -> int:
@@ -136,7 +136,7 @@ class _Descent(Generic[C]):
 
     def _epoch(self) -> None:
         train, weight = self._trusted()
-        order = torch.randperm(len(train.labeler), generator=self.order)
+        order = torch.randperm(len(train.labeler), generator=self.order).to(weight.device)
         for part in train.minibatches(order, self.fitting.batch_size):
             # One generator for the order, for crops and for pseudo-labels: one seed repeats the fit.
             self._step(self.problem.loss(part, weight, self.order))
@@ -147,7 +147,7 @@ class _Descent(Generic[C]):
         if self.fitting.denoise == "off":
             return problem.train, problem.weight
         sums, counts = per_judgement(problem.train, _beside_ignorance(problem, problem.train)[None])
-        pairs = torch.tensor(self.fitting.denoise == "flip") & _is_pair(problem.train, counts)
+        pairs = _is_pair(problem.train, counts) & (self.fitting.denoise == "flip")
         verdict, self.discriminator = self.discriminator.judge(sums[0] / counts, pairs)
         return flipped(problem.train, verdict.flip), problem.weight * verdict.keep
 
@@ -204,7 +204,7 @@ def _used(part: Terms, counts: Tensor, candidates: int) -> Tensor:
     counted = counts.bool()
     # (E, S K + R), in the order of `candidates()`: a choice mentions K.
     mentions = torch.cat([counted[:, :count].repeat_interleave(width, 1), counted[:, count:]], 1)
-    used = torch.zeros(candidates, len(counts))
+    used = counts.new_zeros(candidates, len(counts))
     # Added up, not assigned: of several mentions of a candidate the last one would win.
     return used.index_add_(0, part.candidates(), mentions.T.float()).bool()
 
@@ -260,13 +260,13 @@ def _beside_ignorance(problem: Problem[C], part: Terms) -> Tensor:
 
     So the best of eight is no more suspect than the better of two, before anything is known.
     """
-    blank = ensemble_losses(problem, part, torch.zeros(problem.reward.members, len(problem.candidates)))
+    blank = ensemble_losses(problem, part, problem.weight.new_zeros(problem.reward.members, len(problem.candidates)))
     # The clamp: where ties are expected anyway, a term can be all but certain before anything is known.
     return ensemble_losses(problem, part) * (math.log(2) / blank.clamp(min=1e-3))
 
 
 def _is_pair(part: Terms, terms: Tensor) -> Tensor:
     """(J,) whether a judgement is a single comparison of two that prefers one."""
-    two = torch.zeros(len(terms), dtype=torch.bool)
+    two = terms.new_zeros(len(terms), dtype=torch.bool)
     two[part.choices.judgement[(part.choices.present.sum(1) == 2) & ~part.choices.tied]] = True
     return two & (terms == 1)

@@ -17,7 +17,7 @@ from prefrl.types import Integers
 
 def preference_logits(scores: Tensor, edges: Integers) -> Tensor:
     """(E, N) scores and (M, 2) edges -> (E, M): how much better the first candidate of each edge is."""
-    first, second = torch.as_tensor(edges).unbind(1)
+    first, second = torch.as_tensor(edges, device=scores.device).unbind(1)
     return scores[:, first] - scores[:, second]
 
 
@@ -41,7 +41,7 @@ def davidson(scores: Tensor, target: Tensor, tied: Tensor, tie: Tensor, error: T
     `tie` (E,) is log nu. For two candidates this is Davidson 1970; for more, Firth, Kosmidis and Turner 2019 (section
     2), who fit one such parameter for each n. `tied` (S,): the target's candidates are tied; else it is a choice.
     """
-    sets = _subsets(scores.shape[-1]).to(scores.dtype)  # (2^K - 1, K)
+    sets = _subsets(scores.shape[-1]).to(scores)  # (2^K - 1, K)
     sizes = sets.sum(1)
     # -inf is filled first: times the 0 of a set without that candidate it would be NaN.
     mean = scores.masked_fill(~scores.isfinite(), 0.0) @ (sets / sizes[:, None]).T  # (E, S, 2^K - 1)

@@ -58,6 +58,7 @@ def crop(stacked: Mapping[str, Tensor], share: float, order: torch.Generator) ->
     shortest = max(1, round(steps * (1 - share)))
     length = int(torch.randint(shortest, steps + 1, (), generator=order))
     places = (stacked["mask"].sum(1) - length).clamp(min=0).long() + 1  # (N,): the last place is one of them
-    begin = (torch.rand(count, generator=order) * places).long()[:, None]  # (N, 1)
-    rows, columns = torch.arange(count)[:, None], begin + torch.arange(length)
-    return {name: x[rows, columns] for name, x in stacked.items()}  # (N, T, ...) -> (N, length, ...), the mask too
+    begin = (torch.rand(count, generator=order).to(places.device) * places).long()[:, None]  # (N, 1)
+    rows, columns = (torch.arange(n, device=places.device) for n in (count, length))
+    # (N, T, ...) -> (N, length, ...), the mask too
+    return {name: x[rows[:, None], begin + columns] for name, x in stacked.items()}

@@ -74,6 +74,11 @@ class Terms:
     scale: int
     """Levels of the ratings, 0 where there are none."""
 
+    def to(self, device: torch.device) -> Terms:
+        """The same terms on a device."""
+        choices, ratings = _moved(self.choices, device), _moved(self.ratings, device)
+        return replace(self, choices=choices, ratings=ratings, labeler=self.labeler.to(device))
+
     def subset(self, keep: Tensor) -> Terms:
         """The terms of the judgements where `keep` (J,) is true, which are counted anew."""
         number = keep.cumsum(0) - 1  # (J,): what the judgements that are kept are counted as
@@ -105,7 +110,7 @@ class Terms:
     def minibatches(self, order: Tensor, size: int) -> Iterator[Terms]:
         """These terms, `size` judgements at a time, in the order of a permutation of the judgements (J,)."""
         place = torch.empty_like(order)  # (J,): the inverse permutation
-        place[order] = torch.arange(len(order))
+        place[order] = torch.arange(len(order), device=order.device)
         count = math.ceil(len(order) / size)
         choices = _partition(self.choices, place[self.choices.judgement] // size, count)
         ratings = _partition(self.ratings, place[self.ratings.judgement] // size, count)
@@ -246,6 +251,10 @@ def _ratings(judged: Sequence[Judged[C]], index: dict[str, int]) -> Ratings:
     columns = list(zip(*rows, strict=True)) if rows else [(), (), (), ()]
     items, level, judgement = (torch.tensor(columns[i], dtype=torch.int64) for i in (0, 1, 3))
     return Ratings(items, level, torch.tensor(columns[2], dtype=torch.float32), judgement)
+
+
+def _moved(rows: Rows, device: torch.device) -> Rows:
+    return type(rows)(*(getattr(rows, field.name).to(device) for field in fields(rows)))
 
 
 def _take(rows: Rows, at: Tensor) -> Rows:

@@ -19,6 +19,7 @@ from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
 from prefrl.judgements import Judged
 from prefrl.protocols import Judgements, RewardModel
+from prefrl.seeding import to_numpy
 from prefrl.types import C, Fitted, Floats, Metrics
 
 
@@ -90,18 +91,21 @@ def _problem(
     # The judged ones first, in the order of `known`: the terms below count them so.
     candidates: list[C] = list(known.values()) + (list(others.values()) if fitting.pseudo_labels else [])
     every = terms(judged, list(known), fitting.ties, fitting.rankings)
-    out = torch.as_tensor(held_out)
+    stacked = reward.stack(candidates)
+    device = next(iter(stacked.values())).device  # where the reward model is, the whole fit is
+    every, out = every.to(device), torch.as_tensor(held_out, device=device)
     train, descends = every.subset(~out), bool(trainable(reward))
+    resampled = _member_weights(train, reward.members, fitting.bootstrap and descends, rng)
     return Problem(
         reward=reward,
         candidates=candidates,
         judged=len(known),
-        stacked=reward.stack(candidates),
+        stacked=stacked,
         every=every,
         train=train,
         test=every.subset(out),
         likelihood=Likelihood(reward.members, every, fitting.ties, fitting.error_rate, fitting.reliability),
-        weight=_member_weights(train, reward.members, fitting.bootstrap and descends, rng),
+        weight=resampled,
         fitting=fitting,
     )
 
@@ -131,14 +135,15 @@ def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.G
     """(E, J) how often each judgement counts: once, or as the bootstrap draws it for each member."""
     count = len(part.labeler)
     if not bootstrap or members == 1:
-        return torch.ones(members, count)
+        return torch.ones(members, count, device=part.labeler.device)
     # Draws with replacement, as counts: every member sees the same minibatches, and weighs them in its own way.
-    return torch.as_tensor(rng.multinomial(count, np.full(count, 1 / count), size=members), dtype=torch.float32)
+    drawn = rng.multinomial(count, np.full(count, 1 / count), size=members)
+    return torch.as_tensor(drawn, dtype=torch.float32, device=part.labeler.device)
 
 
 def _logits(scores: Tensor, data: Batch[C]) -> Floats:
     """(E, M): how much better each member finds the first candidate of each comparison."""
-    found: Floats = preference_logits(scores, data.edges).double().numpy()
+    found: Floats = to_numpy(preference_logits(scores, data.edges).double())
     return found
 
 

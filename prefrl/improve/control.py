@@ -24,6 +24,7 @@ from prefrl.policies.mlp import Decisions, MLPPolicy
 from prefrl.policies.rollout import Rollout, collect, control, joined, learned_rewards, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task
 from prefrl.sample.segments import cut, first_rollout
+from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
@@ -75,6 +76,8 @@ class ControlLearnerSettings(Settings):
     """Of the actions' noise at the start, in units of half the action bounds."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
     @model_validator(mode="before")
     @classmethod
@@ -136,6 +139,7 @@ class ControlLearner:
     def __init__(self, settings: ControlLearnerSettings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
         self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
+        self.policy.to(device_of(settings.device))
         self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._steps, self._rounds = Steps(), 0
         self._recent: Rollout | None = None
@@ -231,10 +235,10 @@ class ControlLearner:
     def _batch(self, rollout: Rollout, rewards: Floats) -> tuple[Batch[Decisions], float]:
         """What the update needs, B = n x T sequences of one step, and how much of the returns the critic explains."""
         settings, policy = self._settings, self.policy
-        observations = torch.from_numpy(policy.normalise(rollout.observations))
+        observations = self._tensor(policy.normalise(rollout.observations))
         values = policy.values_of(observations)  # (n, T)
-        ends = torch.from_numpy(rollout.ends)
-        scaled = torch.from_numpy(rewards).float() * _scale(settings.discount)
+        ends = self._tensor(rollout.ends)
+        scaled = self._tensor(rewards).float() * _scale(settings.discount)
         advantages = gae(scaled, values, self._next_values(rollout, values), ends, settings.discount, settings.trace)
         returns = advantages + values
         # The clamp: returns that do not vary leave nothing to explain.
@@ -242,7 +246,7 @@ class ControlLearner:
         # Whitened only now: the critic's targets above are in the units of the reward.
         white = masked_whiten(advantages, torch.ones_like(advantages))
         # (n, T, .) -> (B, .), in the order that view(-1, 1) gives the other columns below.
-        decisions = Decisions(observations.flatten(0, 1), torch.from_numpy(rollout.choices).flatten(0, 1))
+        decisions = Decisions(observations.flatten(0, 1), self._tensor(rollout.choices).flatten(0, 1))
         # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
         logp, _ = policy.log_prob(decisions)
         return Batch(decisions, logp, white.view(-1, 1), returns.view(-1, 1)), explained
@@ -251,18 +255,22 @@ class ControlLearner:
         """(n, T): the value of what each step led to."""
         unseen = rollout.ends.copy()
         unseen[:, -1] = True  # what follows a row's last step is in the next rollout
-        final = torch.from_numpy(self.policy.normalise(rollout.final_observations[unseen]))
+        final = self._tensor(self.policy.normalise(rollout.final_observations[unseen]))
         # After an end the next column belongs to another episode, so the final observation is valued by itself. The
         # column that fills up the end of each row is among those replaced.
         following = torch.cat([values[:, 1:], values[:, :1]], 1)
-        following[torch.from_numpy(unseen)] = self.policy.values_of(final)
-        return following * ~torch.from_numpy(rollout.terminated)  # a time limit still has a future
+        following[self._tensor(unseen)] = self.policy.values_of(final)
+        return following * ~self._tensor(rollout.terminated)  # a time limit still has a future
 
     def _minibatches(self, size: int, epochs: int, rng: np.random.Generator) -> list[Tensor]:
         parts = max(1, round(size / self._settings.minibatch))
-        orders = [torch.from_numpy(rng.permutation(size)) for _ in range(epochs)]
+        orders = [self._tensor(rng.permutation(size)) for _ in range(epochs)]
         # tensor_split leaves no small remainder, whose gradient would be mostly noise.
         return [rows for order in orders for rows in order.tensor_split(parts)]
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        """An array on the policy's device."""
+        return torch.from_numpy(array).to(self.policy.device)
 
 
 def _scale(discount: float) -> float:

@@ -7,7 +7,6 @@ ranking share its weight. Left out: length normalisation, a supervised term, ref
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -17,11 +16,12 @@ from torch import Tensor
 
 from prefrl.components import Settings
 from prefrl.fit.pairs import Batch, batch
-from prefrl.improve.gradient import descend
+from prefrl.improve.gradient import Parts, descend
 from prefrl.improve.objectives import dpo_loss
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import Responses, text
 from prefrl.protocols import RewardModel, Store, Task, TextTask
+from prefrl.seeding import Device
 from prefrl.types import Evaluation, Integers, Metrics, Response, State, Steps
 
 
@@ -47,6 +47,8 @@ class DPOSettings(Settings):
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=2)
     """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     discount: ClassVar[float] = 1.0  # a response is judged as a whole
 
     def shrunk(self) -> DPOSettings:
@@ -59,7 +61,6 @@ class DPOSettings(Settings):
         return DPO(self, text(task, self.kind))
 
     def formula(self) -> str:
-        """The objective, as text."""
         wrong = f" + {self.label_smoothing:g} log s(-h)" if self.label_smoothing else ""
         return (
             f"maximise  mean[ {1 - self.label_smoothing:g} log s(h){wrong} ],  s(h) = 1 / (1 + exp(-h))\n"
@@ -71,7 +72,8 @@ class DPO:
     """A `prefrl.protocols.Learner` of responses that reads the judgements in the store, and not the reward."""
 
     def __init__(self, settings: DPOSettings, task: TextTask) -> None:
-        self._settings, self._writer = settings, Writer(task, settings.learning_rate, 1.0, settings.chunk)
+        self._settings = settings
+        self._writer = Writer(task, settings.learning_rate, 1.0, settings.chunk, settings.device)
 
     @property
     def steps(self) -> Steps:
@@ -81,15 +83,13 @@ class DPO:
         return self._writer.ask(count, self._settings.asked_responses, rng)
 
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
-        """Passes over all judged pairs; metrics are means over gradient steps.
-
-        loss, grad_norm, pairs, accuracy (the share whose better one gained more on the reference; a tie is half), and
-        margin (by how much, beta x nats). Raises ValueError where no pair was judged.
+        """Passes over all judged pairs. Metrics, means over steps: loss, grad_norm, pairs, accuracy (share whose better
+        one gained more on the reference; a tie is half), margin (how much, beta x nats). Raises ValueError without pairs.
         """
         data, policy = batch(store.judged()), self._writer.policy
         if not len(data):
             raise ValueError("dpo learns from judged pairs; the store holds none: raise loop.labels, or import some")
-        rows = Responses.of(data.candidates, policy.task.tokenizer)
+        rows = Responses.of(data.candidates, policy.task.tokenizer, policy.device)
         # (N,), once: the starting policy does not change. Padding is 0, so the sums are over the responses' own tokens.
         reference, seen = policy.start_logp(rows).sum(1), []
         for _ in range(self._settings.epochs):
@@ -98,16 +98,12 @@ class DPO:
                 seen.append(descend(policy.parameters(), self._writer.optimizer, parts, self._settings.max_grad_norm))
         return {name: float(np.mean([s[name] for s in seen])) for name in seen[0]} | {"pairs": float(len(data))}
 
-    def _parts(
-        self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers
-    ) -> Iterator[tuple[Tensor, dict[str, Tensor]]]:
+    def _parts(self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers) -> Parts:
         """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
-        # `chunk` counts rows, and a pair has two.
         for some in np.array_split(at, -(-2 * len(at) // self._settings.chunk)):
-            # Of the whole minibatch's weight, so that the losses of the parts add up to its mean.
-            share = torch.from_numpy(data.weight[some] / data.weight[at].sum())
-            # (m, 2) -> (2 m,), the two of a pair side by side; view(-1, 2) takes them apart again.
-            pairs, preference = torch.from_numpy(data.edges[some]).flatten(), torch.from_numpy(data.preference[some])
+            # Shares of the whole minibatch: the parts add up to its mean. The two of a pair stand side by side: (2 m,).
+            arrays = (data.weight[some] / data.weight[at].sum(), data.edges[some].flatten(), data.preference[some])
+            share, pairs, preference = (torch.from_numpy(x).to(reference.device) for x in arrays)
             gains = (self._writer.policy.log_prob(rows.rows(pairs))[0].sum(1) - reference[pairs]).view(-1, 2)
             margin = self._settings.beta * (gains[:, 0] - gains[:, 1])
             loss = (dpo_loss(margin, preference, self._settings.label_smoothing) * share).sum()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Generic
+from typing import Generic, TypeAlias
 
 import torch
 from torch import Tensor
@@ -28,6 +28,9 @@ from prefrl.improve.objectives import (
 )
 from prefrl.protocols import I, Policy
 from prefrl.types import Metrics
+
+Parts: TypeAlias = Iterable[tuple[Tensor, dict[str, Tensor]]]
+"""A loss in parts that add up, each with what it measured: (loss, name -> number)."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +137,10 @@ def step(
 def descend(
     parameters: Iterable[torch.nn.Parameter],
     optimizer: torch.optim.Optimizer,
-    parts: Iterable[tuple[Tensor, dict[str, Tensor]]],
+    parts: Parts,
     max_grad_norm: float,
 ) -> Metrics:
-    """One gradient step on a loss that comes in parts, each with what it measured: (loss, name -> number).
+    """One gradient step on a loss that comes in parts.
 
     Losses and measures add up over parts; `ratio_error` is the largest. Raises FloatingPointError, before anything
     changes, where the loss or the gradient is not finite.
@@ -215,7 +218,7 @@ def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Te
     return {
         "clipped": (apart > (objective.clip or math.inf)).sum() / steps,
         # The old policy drew the samples, so this is KL(old || new): k3's d is log old - log new.
-        "kl_old": kl_k3(-ratios, torch.zeros(())).sum() / steps,
+        "kl_old": kl_k3(-ratios, ratios.new_zeros(())).sum() / steps,
         "ratio_error": apart.max(),
     }
 

@@ -24,7 +24,7 @@ from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
 from prefrl.policies.rollout import Rollout, control, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, Store, Task
 from prefrl.sample.segments import cut, first_rollout
-from prefrl.seeding import draw_seed
+from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS = {"PPO": PPO, "SAC": SAC}
@@ -53,6 +53,8 @@ class SB3Settings(Settings):
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, without exploration, in environments of their own."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
     def shrunk(self) -> SB3Settings:
         """One rollout of a batch in each environment for PPO; for SAC about as many steps, learning from the first."""
@@ -196,7 +198,7 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
     python, numpy_ = random.getstate(), np.random.get_state()
     try:
         # CPU only: by default the state of every GPU would be saved as well.
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             seed = draw_seed(rng)
             random.seed(seed)
             np.random.seed(seed)
@@ -212,8 +214,9 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
     if settings.algorithm == "PPO":
         options.setdefault("n_steps", settings.at_once)
     try:
+        device = device_of(settings.device)
         return ALGORITHMS[settings.algorithm](
-            "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device="cpu", verbose=0, **options
+            "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device=device, verbose=0, **options
         )
     except TypeError as error:  # an option that its constructor does not have
         raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error

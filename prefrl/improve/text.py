@@ -22,7 +22,7 @@ from prefrl.improve.objectives import AdaptiveKL, Reduction, group_normalised, k
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import Responses, text
 from prefrl.protocols import RewardModel, Store, Task, TextTask
-from prefrl.seeding import draw_seed
+from prefrl.seeding import Device, generator
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
@@ -79,6 +79,8 @@ class TextLearnerSettings(Settings):
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=1)
     """Rows in one pass of a network: changes memory and speed, and nothing else but rounding."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
     @model_validator(mode="before")
     @classmethod
@@ -127,7 +129,7 @@ class TextLearner:
 
     def __init__(self, settings: TextLearnerSettings, task: TextTask) -> None:
         self._settings, self._task = settings, task
-        self._writer = Writer(task, settings.learning_rate, settings.temperature, settings.chunk)
+        self._writer = Writer(task, settings.learning_rate, settings.temperature, settings.chunk, settings.device)
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0
@@ -170,7 +172,8 @@ class TextLearner:
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
         settings = self._settings
-        raw = torch.as_tensor(reward.score(drawn.candidates(self._task.tokenizer)), dtype=torch.float32)  # (B,)
+        found = reward.score(drawn.candidates(self._task.tokenizer))  # (B,)
+        raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
         scores = self._finite("reward", raw - settings.missing_end_penalty * ~drawn.ended)
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
@@ -214,9 +217,9 @@ class TextLearner:
         return drawn.logp if self._settings.beta == 0 else self.policy.start_logp(drawn)
 
     def _minibatches(self, size: int, rng: np.random.Generator) -> list[Tensor]:
-        order = torch.Generator().manual_seed(draw_seed(rng))
+        order = generator(rng)
         each = -(-size // self._settings.minibatches)  # rounded up, so that there are no more than asked for
-        orders = [torch.randperm(size, generator=order) for _ in range(self._settings.epochs)]
+        orders = [torch.randperm(size, generator=order).to(self.policy.device) for _ in range(self._settings.epochs)]
         return [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
 
     def _finite(self, name: str, values: Tensor) -> Tensor:

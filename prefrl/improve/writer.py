@@ -10,14 +10,16 @@ from prefrl.evaluate.policies import responses
 from prefrl.improve.gradient import adam
 from prefrl.policies.language import LanguagePolicy, Responses
 from prefrl.protocols import RewardModel, TextTask
+from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Response, State, Steps
 
 
 class Writer:
     """A policy with its optimiser, and how many tokens it wrote for what."""
 
-    def __init__(self, task: TextTask, learning_rate: float, temperature: float, part: int) -> None:
+    def __init__(self, task: TextTask, learning_rate: float, temperature: float, part: int, device: Device) -> None:
         self.policy = LanguagePolicy(task, temperature, part)
+        self.policy.to(device_of(device))
         self.optimizer = adam(self.policy.parameters(), learning_rate)
         self.steps = Steps()
 

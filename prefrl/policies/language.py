@@ -15,7 +15,7 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 from prefrl.components import ConfigError
 from prefrl.policies.generate import Sampling, generate
 from prefrl.protocols import Task, TextTask
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 from prefrl.types import Response, State
 
 
@@ -47,13 +47,13 @@ class Responses:
         """Some rows, cut to the longest of them."""
         width = int(self.mask[at].sum(1).max())
         tokens, mask, logp = (x[at, :width] for x in (self.tokens, self.mask, self.logp))
-        chosen = [int(i) for i in at]
+        chosen = at.tolist()
         prompts, prompt_tokens = tuple(self.prompts[i] for i in chosen), tuple(self.prompt_tokens[i] for i in chosen)
         return Responses(prompts, prompt_tokens, tokens, mask, logp, self.ended[at])
 
     def lengths(self) -> Tensor:
         """(B,) tokens of prompt and response together."""
-        return self.mask.sum(1) + torch.tensor([len(p) for p in self.prompt_tokens])
+        return self.mask.sum(1) + self.mask.new_tensor([len(p) for p in self.prompt_tokens], dtype=torch.int64)
 
     def parts(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
         """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
@@ -61,7 +61,9 @@ class Responses:
             yield at, self.rows(at)
 
     @classmethod
-    def of(cls, candidates: Sequence[Response], tokenizer: PreTrainedTokenizerBase) -> Responses:
+    def of(
+        cls, candidates: Sequence[Response], tokenizer: PreTrainedTokenizerBase, device: torch.device | None = None
+    ) -> Responses:
         """Responses that were sampled as they were; those that came as text alone are encoded, an end token added."""
         ends, pairs = int(tokenizer.eos_token_id), []
         for one in candidates:
@@ -69,13 +71,12 @@ class Responses:
             prompt = one.prompt_tokens or tuple(tokenizer.encode(one.prompt))
             tokens = one.tokens or (*tokenizer.encode(one.text, add_special_tokens=False), ends)
             pairs.append((prompt, tokens))
-        lengths = torch.tensor([len(tokens) for _, tokens in pairs])
-        mask = torch.arange(int(lengths.max())) < lengths[:, None]
-        padded = torch.zeros(mask.shape, dtype=torch.int64)
-        padded[mask] = torch.tensor([token for _, tokens in pairs for token in tokens])  # a mask is filled row by row
-        ended = torch.tensor([tokens[-1] == ends for _, tokens in pairs])
-        texts = tuple(one.prompt for one in candidates)
-        return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, torch.zeros(mask.shape), ended)
+        padded, lengths = pad_right([tokens for _, tokens in pairs], device)
+        mask = torch.arange(padded.shape[1], device=device) < lengths[:, None]
+        ended = torch.tensor([tokens[-1] == ends for _, tokens in pairs], device=device)
+        # a mask is filled row by row
+        texts, unknown = tuple(one.prompt for one in candidates), torch.zeros(mask.shape, device=device)
+        return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, unknown, ended)
 
     def candidates(self, tokenizer: PreTrainedTokenizerBase) -> list[Response]:
         """The same as the vocabulary's `Response`s, without gold."""
@@ -100,6 +101,15 @@ class LanguagePolicy:
         self.model, self.start = task.model(), task.model().requires_grad_(False)  # two copies of the weights
         check_head(self.model)
 
+    @property
+    def device(self) -> torch.device:
+        return self.model.device
+
+    def to(self, device: torch.device) -> None:
+        """Move both models to a device."""
+        for model in (self.model, self.start):
+            model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
+
     def parameters(self) -> list[torch.nn.Parameter]:
         return list(self.model.parameters())
 
@@ -117,7 +127,7 @@ class LanguagePolicy:
         encoded = [tuple(tokenizer.encode(prompt)) for prompt in prompts]
         ends, temperature = (int(tokenizer.eos_token_id),), self.temperature if temperature is None else temperature
         sampling = Sampling(samples, self.task.response_tokens, ends, temperature)
-        drawn = generate(self.model, encoded, sampling, torch.Generator().manual_seed(draw_seed(rng)))
+        drawn = generate(self.model, encoded, sampling, generator(rng))
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
@@ -154,25 +164,24 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
     Rows are padded on the right, where a causal model never looks: no attention mask and no position ids are needed.
     The head runs on the real tokens of the responses only.
     """
-    lengths = torch.tensor([len(p) for p in responses.prompt_tokens])
     rows, steps = responses.mask.nonzero(as_tuple=True)  # (n,), (n,): the n real tokens, row by row
+    prompts, lengths = pad_right(responses.prompt_tokens, responses.mask.device)
     places = lengths[rows] + steps  # (n,): the column of each, after its prompt
-    ids = torch.zeros(len(responses), int(places.max()) + 1, dtype=torch.int64)  # padded with 0, which is a valid id
-    for row, prompt in zip(ids, responses.prompt_tokens, strict=True):
-        row[: len(prompt)] = torch.tensor(prompt)
+    ids = prompts.new_zeros(len(responses), int(places.max()) + 1)  # padded with 0, which is a valid id
+    ids[:, : prompts.shape[1]] = prompts
     chosen = responses.tokens[rows, steps]
     ids[rows, places] = chosen
     hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
     logits = head_logits(model, hidden[rows, places - 1])  # (n, V): the state before a token predicts it
     # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
     found = -torch.nn.functional.cross_entropy(logits.float() / temperature, chosen, reduction="none")
-    return torch.zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
+    return found.new_zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
 
 
 @torch.no_grad()
 def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, part: int) -> Tensor:
     """`response_logp` without gradients, a part of the rows at a time."""
-    found = torch.zeros(responses.mask.shape)
+    found = torch.zeros(responses.mask.shape, device=responses.mask.device)
     for at, rows in responses.parts(part):
         found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)  # a part is cut to its longest row
     return found
@@ -193,6 +202,13 @@ def check_head(model: PreTrainedModel) -> None:
     ours = head_logits(model, model.base_model(input_ids=ids, use_cache=False).last_hidden_state)
     if not torch.allclose(direct, ours, atol=1e-4, rtol=1e-4):
         raise ConfigError(f"{type(model).__name__} does more to its logits than its head says; this is not supported")
+
+
+def pad_right(rows: Sequence[Sequence[int]], device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """(N, L) int64 token ids, right-padded with 0, which is a valid id; and how many of each row are real (N,)."""
+    width = max(map(len, rows))
+    ids = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows], dtype=torch.int64, device=device)
+    return ids, torch.tensor([len(row) for row in rows], device=device)
 
 
 def text(task: Task, kind: str) -> TextTask:

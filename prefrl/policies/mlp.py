@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from prefrl.protocols import ControlTask
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator, to_numpy
 from prefrl.types import Floats, State
 
 CLIP = 10.0
@@ -84,12 +84,20 @@ class MLPPolicy:
 
     def __init__(self, task: ControlTask, hidden: tuple[int, ...], initial_std: float, rng: np.random.Generator):
         self.space = ActionSpace.of(task)
-        generator = torch.Generator().manual_seed(draw_seed(rng))
-        size = task.observation_size
-        self.actor = _mlp((size, *hidden, task.action_size), 0.01, generator)
-        self.critic = _mlp((size, *hidden, 1), 1.0, generator)
+        size, order = task.observation_size, generator(rng)
+        self.actor = _mlp((size, *hidden, task.action_size), 0.01, order)
+        self.critic = _mlp((size, *hidden, 1), 1.0, order)
         self.log_std = torch.nn.Parameter(torch.full((task.action_size,), math.log(initial_std)))
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
+
+    @property
+    def device(self) -> torch.device:
+        return self.log_std.device
+
+    def to(self, device: torch.device) -> None:
+        """Move the weights to a device; acting and the normaliser stay NumPy."""
+        for _, parameter in self._named():
+            parameter.data = parameter.data.to(device)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         return [*self.actor, *([] if self.space.discrete else [self.log_std]), *self.critic]
@@ -130,7 +138,7 @@ class MLPPolicy:
             choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
             return choices, choices
         if rng is not None:
-            std = np.exp(self.log_std.detach().numpy())
+            std = np.exp(to_numpy(self.log_std))
             outputs = outputs + std * rng.standard_normal(outputs.shape, np.float32)
         return outputs, self.space.execute(outputs)
 
@@ -172,7 +180,7 @@ class MLPPolicy:
         return nets + [(f"critic_{i}", p) for i, p in enumerate(self.critic)] + [("log_std", self.log_std)]
 
     def _actor_numpy(self, x: Floats) -> Floats:
-        arrays = [p.detach().numpy() for p in self.actor]  # views, which follow the optimiser's steps
+        arrays = [to_numpy(p) for p in self.actor]  # views, which follow the optimiser's steps
         for i in range(0, len(arrays) - 2, 2):
             x = np.tanh(x @ arrays[i].T + arrays[i + 1])
         out: Floats = x @ arrays[-2].T + arrays[-1]
@@ -192,11 +200,11 @@ def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:
     return torch.nn.functional.linear(x, net[-2], net[-1])
 
 
-def _mlp(sizes: tuple[int, ...], last_gain: float, generator: torch.Generator) -> list[torch.nn.Parameter]:
+def _mlp(sizes: tuple[int, ...], last_gain: float, order: torch.Generator) -> list[torch.nn.Parameter]:
     net = []
     for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         # 0.01 for the actor: it starts with about the same distribution in every state.
         gain = last_gain if i == len(sizes) - 2 else math.sqrt(2)
-        weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, generator)
+        weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, order)
         net += [torch.nn.Parameter(weight), torch.nn.Parameter(torch.zeros(fan_out))]
     return net

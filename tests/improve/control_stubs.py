@@ -73,6 +73,8 @@ class Known:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return []
 
+    def to(self, device: torch.device) -> None: ...
+
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: object) -> torch.Tensor:
         raise NotImplementedError
 

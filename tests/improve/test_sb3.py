@@ -52,6 +52,19 @@ def test_the_discount_is_what_stable_baselines3_calls_gamma() -> None:
 
 
 @both
+def test_the_algorithm_computes_on_the_device_that_the_settings_name(
+    algorithm: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[torch.device] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    name = algorithm["algorithm"]
+    monkeypatch.setitem(ALGORITHMS, name, lambda *_, device, **__: made.append(device))
+    for device in ("cpu", "cuda", "auto"):
+        _learner(point(), algorithm, device=device)
+    assert [device.type for device in made] == ["cpu", "cuda", "cuda"]
+
+
+@both
 def test_every_step_of_the_environments_is_counted_once_by_purpose(
     store: Store[Segment], algorithm: dict[str, Any]
 ) -> None:
