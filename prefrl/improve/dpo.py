@@ -84,7 +84,7 @@ class DPO:
 
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
         """Passes over all judged pairs. Metrics, means over steps: loss, grad_norm, pairs, accuracy (share whose better
-        one gained more on the reference; a tie is half), margin (how much, beta x nats). Raises ValueError with no pair.
+        one gained more on the reference; a tie is half), margin (beta x nats). Raises ValueError without a judged pair.
         """
         data, policy = batch(store.judged()), self._writer.policy
         if not len(data):
