@@ -12,7 +12,7 @@ import numpy as np
 
 from prefrl.judgements import Answer, Judged
 from prefrl.seeding import Device
-from prefrl.types import C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
+from prefrl.types import Bools, C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
 
 if TYPE_CHECKING:
     import torch
@@ -52,6 +52,32 @@ class TaskSettings(Protocol):
     def build(self) -> Task: ...
 
 
+class Dynamics(Protocol):
+    """A world as a value: pure functions of states that are rows of an array, n of them side by side.
+
+    `prefrl.envs.fast.vectorised.Vectorised` makes `Environments` of it.
+    """
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        """(n, S) float64 first states."""
+
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
+        """States (n, S) and actions (n, A) -> new arrays: next states (n, S), rewards (n,), terminated (n,).
+
+        Chance in a step is drawn from `rng`, for all n at once.
+        """
+
+    def observe(self, states: Floats) -> Floats:
+        """(n, S) -> (n, O) float32."""
+
+    def legal(self, states: Floats) -> Bools | None:
+        """(n, A): which of the discrete actions there are in each state, at least one; None in every state where all
+        always are."""
+
+    def picture(self, state: Floats, size: int) -> np.ndarray | None:
+        """(size, size, 3) uint8 of a state (S,), or None where there is nothing to see."""
+
+
 class Environments(Protocol):
     """n environments stepped together. An episode that ends is reset in the same step."""
 
@@ -63,6 +89,9 @@ class Environments(Protocol):
 
     def states(self) -> Floats | None:
         """(n, S) float64 simulator states, enough to draw each environment as it stands, or None."""
+
+    def legal(self) -> Bools | None:
+        """(n, A): which discrete actions each environment allows now; None, always, where all are allowed."""
 
 
 class ControlTask(Task, Protocol):
@@ -350,6 +379,7 @@ class SelectorSettings(Protocol):
 __all__ = [
     "Attended",
     "ControlTask",
+    "Dynamics",
     "Environments",
     "Inputs",
     "Judgements",

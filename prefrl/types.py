@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Integers: TypeAlias = npt.NDArray[np.integer[Any]]
+Bools: TypeAlias = npt.NDArray[np.bool_]
 Metrics: TypeAlias = dict[str, float]
 State: TypeAlias = dict[str, Any]
 """Nested dicts and lists of arrays, tensors, numbers, strings and None: what a checkpoint can hold."""

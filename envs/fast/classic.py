@@ -1,31 +1,14 @@
-"""Classic control, n environments in one NumPy call: gymnasium's equations, and its states to the bit."""
+"""Classic control as `prefrl.protocols.Dynamics`: gymnasium's equations, and its states to the bit."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from prefrl.protocols import Transition
-from prefrl.types import Floats
-
-Bools = npt.NDArray[np.bool_]
-
-
-class Dynamics(Protocol):
-    """The equations of a simulator whose whole state is an array; pure functions over n environments."""
-
-    def start(self, count: int, rng: np.random.Generator) -> Floats:
-        """(n, S) float64 first states."""
-
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
-        """(n, S), (n, A) -> next states (n, S), rewards (n,), terminated (n,)."""
-
-    def observe(self, states: Floats) -> Floats:
-        """(n, S) -> (n, O) float32."""
+from prefrl.envs.pictures import cartpole, finished, pendulum
+from prefrl.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -36,7 +19,7 @@ class Pendulum:
         high = np.array([np.pi, 1.0])
         return rng.uniform(-high, high, (count, 2))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         angle, velocity = states.T
         # The torque stays float32, as in gymnasium: in float64 the last bits would differ.
         torque = np.clip(actions[:, 0].astype(np.float32), np.float32(-2), np.float32(2))
@@ -49,6 +32,12 @@ class Pendulum:
     def observe(self, states: Floats) -> Floats:
         angle, velocity = states.T
         return np.stack([np.cos(angle), np.sin(angle), velocity], 1).astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        return finished(pendulum(state, size))
 
 
 @dataclass(frozen=True)
@@ -65,7 +54,7 @@ class CartPole:
     def start(self, count: int, rng: np.random.Generator) -> Floats:
         return rng.uniform(-0.05, 0.05, (count, 4))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         down = self._fallen(states)
         x, velocity, angle, spin = states.T
         force = np.where(actions.argmax(1) == 1, 10.0, -10.0)
@@ -84,39 +73,12 @@ class CartPole:
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
 
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        return finished(cartpole(state, size))
+
     def _fallen(self, states: Floats) -> Bools:
         fallen: Bools = (np.abs(states[:, 0]) > 2.4) | (np.abs(states[:, 2]) > 12 * 2 * math.pi / 360)
         return fallen
-
-
-class Vectorised:
-    """n environments of one `Dynamics`; implements `prefrl.protocols.Environments`."""
-
-    def __init__(self, dynamics: Dynamics, count: int, horizon: int) -> None:
-        self._dynamics, self._count, self._horizon = dynamics, count, horizon
-        self._rng = np.random.default_rng(0)
-        self._states: Floats = np.zeros((count, 0))
-        self._elapsed = np.zeros(count, np.int64)
-
-    def reset(self, rng: np.random.Generator) -> Floats:
-        self._rng = rng
-        self._states = self._dynamics.start(self._count, rng)
-        self._elapsed[:] = 0
-        return self._dynamics.observe(self._states)
-
-    def step(self, actions: Floats) -> Transition:
-        states, rewards, terminated = self._dynamics.advance(self._states, actions)
-        self._elapsed += 1
-        # Never both: where something follows to bootstrap from, and where nothing does, must be told apart.
-        truncated = (self._elapsed >= self._horizon) & ~terminated
-        final = observations = self._dynamics.observe(states)  # before any reset below
-        ended = terminated | truncated
-        if ended.any():
-            states[ended] = self._dynamics.start(int(ended.sum()), self._rng)
-            self._elapsed[ended] = 0
-            observations = self._dynamics.observe(states)
-        self._states = states
-        return Transition(observations, rewards, terminated, truncated, final)
-
-    def states(self) -> Floats:
-        return self._states

@@ -14,9 +14,8 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from prefrl.envs.fast.classic import Bools
 from prefrl.protocols import Transition
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -90,6 +89,9 @@ class Locomotion:
 
     def states(self) -> Floats:
         return self._states
+
+    def legal(self) -> Bools | None:
+        return None
 
     def _start(self, i: int) -> None:
         data, (qpos, qvel), noise = self._data[i], self._memory[i], self._body.reset_noise

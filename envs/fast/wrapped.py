@@ -11,7 +11,7 @@ import numpy as np
 
 from prefrl.protocols import Transition
 from prefrl.seeding import draw_seed
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 class Wrapped:
@@ -45,6 +45,10 @@ class Wrapped:
     def states(self) -> Floats | None:
         rows = [physics_state(env) for env in self._envs]
         return None if any(row is None for row in rows) else np.array(rows, np.float64)
+
+    def legal(self) -> Bools | None:
+        """gymnasium has no word for moves that are not legal."""
+        return None
 
     def _action(self, env: gymnasium.Env[Any, Any], action: Floats) -> Any:
         if not self._discrete:

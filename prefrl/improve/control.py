@@ -21,7 +21,16 @@ from prefrl.evaluate.policies import evaluation
 from prefrl.improve.gradient import Batch, Objective, adam, steer, update
 from prefrl.improve.objectives import gae, masked_whiten
 from prefrl.policies.mlp import Decisions, MLPPolicy
-from prefrl.policies.rollout import Rollout, collect, control, joined, learned_rewards, step_rewards, whole_episodes
+from prefrl.policies.rollout import (
+    Act,
+    Rollout,
+    collect,
+    control,
+    joined,
+    learned_rewards,
+    step_rewards,
+    whole_episodes,
+)
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of
@@ -153,7 +162,7 @@ class ControlLearner:
         rollout = self._recent
         if rollout is None:
             most = self._settings.environments
-            rollout = first_rollout(self._task, lambda o: self.policy.act(o, rng), count, most, rng)
+            rollout = first_rollout(self._task, self._act(rng), count, most, rng)
             self._steps = self._steps.add(query=rollout.ends.size)
         return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
 
@@ -167,7 +176,7 @@ class ControlLearner:
         envs, rollouts, metrics = self._task.environments(count), [], []
         observations = envs.reset(rng)
         for number, steps in enumerate(self._rollout_lengths()):
-            rollout, observations = collect(envs, observations, steps, lambda o: self.policy.act(o, rng))
+            rollout, observations = collect(envs, observations, steps, self._act(rng))
             self._steps = self._steps.add(learn=rollout.ends.size)
             # Only before the first rollout is the reward one that the critic has not seen.
             metrics.append(self._learn(rollout, scorer, rng, critic_first=number == 0))
@@ -179,7 +188,7 @@ class ControlLearner:
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
         episodes = self._settings.evaluation_episodes
-        rollout = whole_episodes(self._task, lambda o: self.policy.act(o, None), episodes, rng)
+        rollout = whole_episodes(self._task, self._act(None), episodes, rng)
         self._steps = self._steps.add(evaluate=rollout.ends.size)
         return evaluation(self._task, rollout, reward)
 
@@ -246,7 +255,8 @@ class ControlLearner:
         # Whitened only now: the critic's targets above are in the units of the reward.
         white = masked_whiten(advantages, torch.ones_like(advantages))
         # (n, T, .) -> (B, .), in the order that view(-1, 1) gives the other columns below.
-        decisions = Decisions(observations.flatten(0, 1), self._tensor(rollout.choices).flatten(0, 1))
+        legal = None if rollout.legal is None else self._tensor(rollout.legal).flatten(0, 1)
+        decisions = Decisions(observations.flatten(0, 1), self._tensor(rollout.choices).flatten(0, 1), legal)
         # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
         logp, _ = policy.log_prob(decisions)
         return Batch(decisions, logp, white.view(-1, 1), returns.view(-1, 1)), explained
@@ -267,6 +277,10 @@ class ControlLearner:
         orders = [self._tensor(rng.permutation(size)) for _ in range(epochs)]
         # tensor_split leaves no small remainder, whose gradient would be mostly noise.
         return [rows for order in orders for rows in order.tensor_split(parts)]
+
+    def _act(self, rng: np.random.Generator | None) -> Act:
+        """The policy's choices, drawn from `rng`, or its mode."""
+        return lambda observations, legal: self.policy.act(observations, rng, legal)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         """An array on the policy's device."""

@@ -25,7 +25,7 @@ from prefrl.policies.rollout import Rollout, control, step_rewards, whole_episod
 from prefrl.protocols import ControlTask, RewardModel, Store, Task
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of, draw_seed
-from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
+from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS = {"PPO": PPO, "SAC": SAC}
 PPO_STEPS = 2048
@@ -184,7 +184,7 @@ class SB3:
         self._steps, self._rounds = Steps(*state["steps"]), state["rounds"]
 
     def _act(self, deterministic: bool) -> Any:
-        def act(observations: Floats) -> tuple[Floats, Floats]:
+        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
             chosen, _ = self.model.predict(observations, deterministic=deterministic)
             actions = executed(self._env.action_space, chosen)
             return actions, actions

@@ -12,10 +12,13 @@ from torch import Tensor
 
 from prefrl.protocols import ControlTask
 from prefrl.seeding import generator, to_numpy
-from prefrl.types import Floats, State
+from prefrl.types import Bools, Floats, State
 
 CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations."""
+ILLEGAL = -1e9
+"""The logit of an action that is not legal (Huang and Ontanon 2022, section 3): its probability is 0, and 0 times its
+logarithm is 0 as well, where minus infinity would make NaN of it."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ class Decisions:
     """(B, O) normalised."""
     choices: Tensor
     """(B, A)."""
+    legal: Tensor | None = None
+    """(B, A) bool: which discrete actions there were; None where there were all."""
 
     @property
     def mask(self) -> Tensor:
@@ -67,7 +72,7 @@ class Decisions:
         return self.choices.new_ones(len(self.choices), 1, dtype=torch.bool)
 
     def rows(self, at: Tensor) -> Decisions:
-        return Decisions(self.observations[at], self.choices[at])
+        return Decisions(self.observations[at], self.choices[at], None if self.legal is None else self.legal[at])
 
     def lengths(self) -> Tensor:
         return self.choices.new_ones(len(self.choices), dtype=torch.int64)
@@ -129,10 +134,16 @@ class MLPPolicy:
         self.mean = self.mean + delta * len(new) / total
         self.variance, self.count = squares / total, total
 
-    def act(self, observations: Floats, rng: np.random.Generator | None) -> tuple[Floats, Floats]:
-        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None."""
+    def act(
+        self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
+    ) -> tuple[Floats, Floats]:
+        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None.
+
+        `legal` (n, A): which discrete actions there are; the others are not chosen.
+        """
         outputs = self._actor_numpy(self.normalise(observations))
         if self.space.discrete:
+            outputs = outputs if legal is None else np.where(legal, outputs, -np.inf)
             # The largest of logits plus Gumbel noise is a draw from their softmax.
             noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
             choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
@@ -146,6 +157,7 @@ class MLPPolicy:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
         outputs = forward(self.actor, inputs.observations)
         if self.space.discrete:
+            outputs = outputs if inputs.legal is None else outputs.masked_fill(~inputs.legal, ILLEGAL)
             logp = (outputs.log_softmax(-1) * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
             return logp, categorical_entropy(outputs)[:, None]
         scaled = (inputs.choices - outputs) * (-self.log_std).exp()

@@ -10,10 +10,11 @@ import numpy as np
 
 from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel, Task
-from prefrl.types import Floats, Segment, State
+from prefrl.types import Bools, Floats, Segment, State
 
-Act: TypeAlias = Callable[[Floats], tuple[Floats, Floats]]
-"""(n, O) observations -> (n, A) what the policy chose, and (n, A) what the environment is to execute."""
+Act: TypeAlias = Callable[[Floats, Bools | None], tuple[Floats, Floats]]
+"""(n, O) observations, and (n, A) which discrete actions are legal or None where all are -> (n, A) what the policy
+chose, and (n, A) what the environment is to execute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,8 @@ class Rollout:
     """(n, T) float64. Hidden: for segments that an oracle is asked about, and for evaluation."""
     states: Floats | None
     """(n, T, S) float64 simulator states before each action."""
+    legal: Bools | None = None
+    """(n, T, A) which discrete actions there were; None where there always were all."""
 
     @property
     def ends(self) -> np.ndarray:
@@ -68,11 +71,12 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
     """
     rows = []
     for t in range(steps):
-        states = envs.states()  # before the step: a segment shows the state in which each action was taken
-        choices, actions = act(observations)
+        # before the step: a segment shows the state in which each action was taken
+        states, legal = envs.states(), envs.legal()
+        choices, actions = act(observations, legal)
         step = envs.step(actions)
         # A copy: some simulators go on writing into the array that they gave out.
-        rows.append((observations, choices, actions, step, None if states is None else states.copy()))
+        rows.append((observations, choices, actions, step, None if states is None else states.copy(), legal))
         # The final ones: a reset in the same step would hide a simulation that went to infinity.
         if not np.isfinite(step.final_observations).all():
             raise FloatingPointError(_not_finite(step.final_observations, actions, t))
@@ -87,6 +91,7 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
         truncated=np.stack([s.truncated for s in steps_], 1),
         gold=np.stack([s.rewards for s in steps_], 1),
         states=None if rows[0][4] is None else np.stack([cast(Floats, row[4]) for row in rows], 1),
+        legal=None if rows[0][5] is None else np.stack([cast(Bools, row[5]) for row in rows], 1),
     )
     return rollout, observations
 

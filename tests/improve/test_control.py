@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from pydantic import ValidationError
 
 from prefrl.components import ConfigError
@@ -221,3 +223,25 @@ def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> No
     assert (plain.clip, plain.epochs, plain.trace) == (None, 1, 0.9)
     assert ControlLearnerSettings.model_validate(plain.model_dump()) == plain
     assert ControlLearnerSettings(algorithm="a2c").rollout_steps == 16
+
+
+def test_it_learns_where_some_moves_are_not_legal(store: Store[Segment]) -> None:
+    learner = _learner(corridor(), seed=1, steps_per_round=800, epochs=4, discount=0.9, learning_rate=1e-2)
+    reward = Known(lambda observations, actions: observations[..., 0])
+    before = learner.evaluate(reward, np.random.default_rng(9)).metrics["gold"]
+    metrics = [learner.improve(reward, store, np.random.default_rng(number)) for number in range(2)]
+    assert learner.evaluate(reward, np.random.default_rng(9)).metrics["gold"] > max(before, 28.0)  # 36 at the most
+    assert all(m["ratio_error"] < 1e-5 for m in metrics)
+    assert metrics[0]["entropy"] < np.log(3)
+
+
+def test_the_legal_moves_of_a_rollout_are_kept_and_saved(store: Store[Segment], tmp_path: Path) -> None:
+    learner = _learner(corridor(), steps_per_round=40)
+    learner.improve(Known(), store, np.random.default_rng(0))
+    recent = learner.state()["recent"]
+    np.testing.assert_array_equal(recent["legal"][..., 0], recent["observations"][..., 0] > 0)
+    assert (recent["choices"] * ~recent["legal"]).sum() == 0.0
+    save_state(tmp_path, "learner", learner.state())
+    other = _learner(corridor(), seed=1, steps_per_round=40)
+    other.load(load_state(tmp_path, "learner"))
+    np.testing.assert_array_equal(other.state()["recent"]["legal"], recent["legal"])

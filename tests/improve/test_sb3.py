@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from stable_baselines3 import PPO as SB3PPO
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -292,3 +293,9 @@ def test_relabelling_follows_the_ring_through_ends_and_resets() -> None:
         place = 50.0 if t == 8 else place + 1  # a reset without an end, as between two rounds
     relabel(buffer, Ageing())  # type: ignore[arg-type]
     assert buffer.rewards[:, 0].tolist() == [3, 1, 2, 1, 2, 3, 1, 2]
+
+
+def test_an_algorithm_that_does_not_know_legal_moves_is_stopped_at_the_first_that_is_not() -> None:
+    learner = _learner(corridor(), PPO)
+    with pytest.raises(ValueError, match=r"is not legal there; .* learner.kind=control"):
+        learner.sample(10, np.random.default_rng(0))

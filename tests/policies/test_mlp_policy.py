@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from corridor import corridor
 
 from prefrl.envs.control import ControlSettings
 from prefrl.policies.mlp import ActionSpace, Decisions, MLPPolicy, categorical_entropy, forward
@@ -90,3 +91,53 @@ def test_state_and_load_give_the_same_policy() -> None:
 
 def test_entropy_of_even_odds_is_the_logarithm_of_the_choices() -> None:
     torch.testing.assert_close(categorical_entropy(torch.zeros(2, 5)), torch.full((2,), math.log(5)))
+
+
+LEGAL = np.array([[True, False, True], [True, True, True], [False, True, False]])
+
+
+def test_actions_that_are_not_legal_are_never_chosen() -> None:
+    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    policy.actor[-1].data = torch.tensor([0.0, 3.0, 0.5])
+    observations, legal = np.zeros((3_000, 1), np.float32), np.tile(LEGAL, (1_000, 1))
+    drawn, _ = policy.act(observations, np.random.default_rng(1), legal)
+    mode, _ = policy.act(observations[:3], None, LEGAL)
+    assert not drawn[~legal].any()
+    assert mode.argmax(1).tolist() == [2, 1, 1]
+    expected = policy.log_prob(_three(np.eye(3, dtype=np.float32)[[2, 2, 2]]))[0].exp().detach()[:, 0]
+    shares = drawn.reshape(1_000, 3, 3)[:, :, 2].mean(0)
+    np.testing.assert_allclose(shares, expected.numpy(), atol=0.05)
+
+
+def test_the_densities_of_legal_actions_are_those_of_a_choice_among_them_alone() -> None:
+    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    policy.actor[-1].data = torch.tensor([0.0, 3.0, 0.5])
+    choices = np.eye(3, dtype=np.float32)[[2, 0, 1]]
+    logp, entropy = policy.log_prob(_three(choices))
+    outputs = forward(policy.actor, torch.zeros(3, 1)).detach()
+    for i in range(3):
+        alone = torch.distributions.Categorical(logits=outputs[i][torch.from_numpy(LEGAL[i])])
+        place = int(LEGAL[i][: int(choices[i].argmax())].sum())
+        assert float(logp[i].detach()) == pytest.approx(float(alone.log_prob(torch.tensor(place))), abs=1e-6)  # type: ignore[no-untyped-call]
+        assert float(entropy[i].detach()) == pytest.approx(float(alone.entropy()), abs=1e-6)  # type: ignore[no-untyped-call]
+    (logp.sum() + entropy.sum()).backward()  # type: ignore[no-untyped-call]
+    gradient = policy.actor[-1].grad
+    assert gradient is not None
+    assert gradient.isfinite().all()
+
+
+def test_where_all_actions_are_legal_it_is_as_if_nobody_had_asked() -> None:
+    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    choices, every = np.eye(3, dtype=np.float32), np.ones((3, 3), bool)
+    free = Decisions(torch.zeros(3, 1), torch.from_numpy(choices))
+    told = Decisions(free.observations, free.choices, torch.from_numpy(every))
+    for one, other in zip(policy.log_prob(free), policy.log_prob(told.rows(torch.arange(3))), strict=True):
+        assert torch.equal(one, other)
+    observations = np.ones((3, 1), np.float32)
+    with_mask, without = (policy.act(observations, np.random.default_rng(0), legal)[0] for legal in (every, None))
+    np.testing.assert_array_equal(with_mask, without)
+
+
+def _three(choices: np.ndarray) -> Decisions:
+    """In the three situations of LEGAL."""
+    return Decisions(torch.zeros(3, 1), torch.from_numpy(choices), torch.from_numpy(LEGAL))

@@ -13,14 +13,14 @@ from prefrl.evaluate.policies import evaluation
 from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, whole_episodes
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.steps import StepReward
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 def _task(**settings: object) -> GymnasiumTask:
     return ControlSettings.model_validate({"env": "Pendulum-v1", "horizon": 7, "segment_steps": 3, **settings}).build()
 
 
-def _act(observations: Floats) -> tuple[Floats, Floats]:
+def _act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
     actions = observations[:, :1] * 0.5
     return actions, actions
 
@@ -39,7 +39,8 @@ def test_parts_joined_are_what_one_collection_would_have_been() -> None:
     first, observations = collect(envs, envs.reset(np.random.default_rng(0)), 9, _act)
     second, _ = collect(envs, observations, 8, _act)
     whole = _rollout()
-    assert all(np.array_equal(a, whole.state()[name]) for name, a in joined([first, second]).state().items())
+    for name, values in joined([first, second]).state().items():
+        np.testing.assert_array_equal(values, whole.state()[name])
 
 
 def test_whole_episodes_spend_exactly_a_fixed_horizon() -> None:
@@ -60,6 +61,9 @@ def test_an_observation_that_is_not_finite_is_an_error_that_names_it_and_the_ste
             return self.inner.reset(rng)
 
         def states(self) -> Floats | None:
+            return None
+
+        def legal(self) -> Bools | None:
             return None
 
         def step(self, actions: Floats):  # type: ignore[no-untyped-def]

@@ -13,14 +13,14 @@ from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.policies.rollout import Act, Rollout, collect
 from prefrl.sample.queries import groups
 from prefrl.sample.segments import OVERLAP, _ages, cut, first_rollout, windows
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 def _task(**settings: object) -> GymnasiumTask:
     return ControlSettings.model_validate({"env": "Pendulum-v1", "horizon": 7, "segment_steps": 3, **settings}).build()
 
 
-def _act(observations: Floats) -> tuple[Floats, Floats]:
+def _act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
     actions = observations[:, :1] * 0.5
     return actions, actions
 
@@ -29,7 +29,7 @@ def _alternating() -> Act:
     """Push left and right by turns: a pole stands for some 30 steps."""
     turn = iter(range(10_000))
 
-    def act(observations: Floats) -> tuple[Floats, Floats]:
+    def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
         actions = np.tile(np.eye(2, dtype=np.float32)[next(turn) % 2], (len(observations), 1))
         return actions, actions
 
@@ -99,7 +99,7 @@ def test_steps_of_a_first_rollout_are_shared_by_as_many_segments_as_promised(mos
 def test_a_first_rollout_stops_as_soon_as_it_holds_enough_where_episodes_end_early() -> None:
     task = _task(env="CartPole-v1", horizon=60, segment_steps=44, variable_horizon=True)
     rollout = first_rollout(task, _alternating(), 40, 2, np.random.default_rng(0))
-    less = Rollout(**{name: values[:, :-60] for name, values in rollout.state().items()})
+    less = Rollout(**{name: values[:, :-60] for name, values in rollout.state().items() if values is not None})
     assert rollout.ends[:, :-1].any()
     assert len(windows(less, 44)[0]) < 40 <= len(windows(rollout, 44)[0])
 
@@ -110,7 +110,7 @@ def test_episodes_that_are_shorter_than_segments_are_an_error_and_not_endless() 
     with pytest.raises(
         ValueError, match=r"hold 0 segments of 150 steps.* 20 were.*longest episode seen had (9|10|11) "
     ):
-        first_rollout(task, lambda o: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0))
+        first_rollout(task, lambda o, legal: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0))
 
 
 def test_windows_are_counted_across_parts_as_in_the_whole() -> None:
