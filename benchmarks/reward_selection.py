@@ -19,7 +19,7 @@ import csv
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -170,19 +170,15 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
 
 def text(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
     """Responses of the starting policy, to prompts for learning and to prompts for evaluation."""
-    from prefrl.policies.generate import Sampling
-    from prefrl.policies.language import respond
+    from prefrl.policies.language import LanguagePolicy
 
-    def respond_to(prompts: list[str], samples: int) -> list[Any]:
-        sampling = Sampling(samples, task.response_tokens, (int(task.tokenizer.eos_token_id),), 1.0)
-        drawn = respond(model, task, prompts, sampling, torch.Generator().manual_seed(samples))
-        found = drawn.candidates(task.tokenizer)
-        return [replace(r, gold=np.array([g])) for r, g in zip(found, task.gold(found), strict=True)]
-
-    model, rng = task.model(), np.random.default_rng(0)
-    return respond_to(task.prompts(case.pool // 4, rng), 4), respond_to(
-        task.evaluation_prompts(case.tested // 4, rng), 4
-    )
+    policy, rng = LanguagePolicy(task, temperature=1.0, part=64), np.random.default_rng(0)
+    drawn = [
+        policy.respond(prompts, 4, np.random.default_rng(4))
+        for prompts in (task.prompts(case.pool // 4, rng), task.evaluation_prompts(case.tested // 4, rng))
+    ]
+    pool, tested = map(policy.with_gold, drawn)
+    return pool, tested
 
 
 def curve(bench: Bench, selector: dict[str, Any], seed: int) -> Iterator[tuple[int, float]]:
