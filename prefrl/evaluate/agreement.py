@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, log_expit, logsumexp
 
-from prefrl.evaluate.card import Bucket, Estimate, LabelerPart, Members, undefined
-from prefrl.evaluate.intervals import share
+from prefrl.evaluate.card import Bucket, LabelerPart, Members
+from prefrl.stats.estimates import Estimate, undefined
+from prefrl.stats.intervals import mean
 from prefrl.stats.raters import cohen
 from prefrl.types import Floats, Integers
 
@@ -69,7 +70,7 @@ class Pairs:
 
     def share(self, hit: Floats, rng: np.random.Generator) -> Estimate:
         """The mean of `hit` (M,) with an interval that knows which comparisons hang together."""
-        return share(hit, self.cluster, rng, self.clusters)
+        return mean(hit, self.cluster, rng, what=self.clusters)
 
 
 def hits(guess: Floats, truth: Floats) -> Floats:

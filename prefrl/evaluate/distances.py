@@ -10,8 +10,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from prefrl.evaluate.card import Distance, Estimate, undefined
+from prefrl.evaluate.card import Distance
 from prefrl.protocols import RewardModel, StepRewardModel
+from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Candidate, Floats, Segment
 
 Reward: TypeAlias = Callable[[Floats, Floats, Floats], Floats]

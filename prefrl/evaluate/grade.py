@@ -12,10 +12,9 @@ import numpy as np
 
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, labeler_part, member_part
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import About, Calibration, Estimate, Gold, ReliabilityBin, ReportCard, Scatter, undefined
+from prefrl.evaluate.card import About, Calibration, Gold, ReliabilityBin, ReportCard, Scatter
 from prefrl.evaluate.distances import distance_part
 from prefrl.evaluate.drift import drift, read_probes
-from prefrl.evaluate.intervals import clusters, correlation
 from prefrl.evaluate.invariance import self_test
 from prefrl.evaluate.lengths import context, length, length_part, sample
 from prefrl.evaluate.summary import read_metrics
@@ -25,6 +24,8 @@ from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.split import split
 from prefrl.judgements import Judged, person
 from prefrl.protocols import Judgements, RewardModel
+from prefrl.stats.estimates import Estimate, undefined
+from prefrl.stats.intervals import clusters, correlation
 from prefrl.storage.files import DamagedError
 from prefrl.types import Candidate, Floats, Integers, Query, Response, Segment, gold_score
 

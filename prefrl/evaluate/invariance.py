@@ -9,8 +9,9 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import expit
 
-from prefrl.evaluate.card import Estimate, Invariance, undefined
+from prefrl.evaluate.card import Invariance
 from prefrl.evaluate.lengths import length
+from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Candidate, Floats, Response, Segment
 
 Score: TypeAlias = Callable[[Sequence[Candidate]], Floats]

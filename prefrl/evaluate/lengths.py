@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from prefrl.evaluate.agreement import Pairs, buckets, hits
-from prefrl.evaluate.card import Lengths, undefined
-from prefrl.evaluate.intervals import correlation
+from prefrl.evaluate.card import Lengths
+from prefrl.stats.estimates import undefined
+from prefrl.stats.intervals import correlation
 from prefrl.types import Candidate, Floats, Integers, Response, Segment
 
 MOST = 2000

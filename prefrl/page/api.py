@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from prefrl.stats.estimates import Estimate
+
 Id: TypeAlias = Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
 """A client-made or server-made 128-bit id."""
 Milliseconds: TypeAlias = Annotated[float, Field(ge=0, le=1e9)]
@@ -252,16 +254,6 @@ class Failure(Plain):
 # --- for admins ----------------------------------------------------------------------------------------------------
 
 
-class Interval(Plain):
-    """A number with its 95 % interval, or the reason why there is none."""
-
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    count: int = 0
-    reason: str = ""
-
-
 class AnnotatorRow(Plain):
     name: str
     role: str
@@ -271,14 +263,14 @@ class AnnotatorRow(Plain):
     median_seconds: float | None
     """Median time to a decision."""
     per_hour: float | None
-    left: Interval
+    left: Estimate
     """P(the left, or first shown, one is preferred), of decided pairs; Wilson's interval."""
-    ties: Interval
-    checks: Interval
+    ties: Estimate
+    checks: Estimate
     """Share of check questions answered as expected."""
-    repeats: Interval
+    repeats: Estimate
     """Share of repeated questions answered alike with sides swapped."""
-    agreement: Interval
+    agreement: Estimate
     """Share of pairs on which this person agrees with the others who judged them."""
     too_fast: int
     """Answers in less than half a clip's length."""
@@ -290,12 +282,12 @@ class AnnotatorRow(Plain):
 class AgreementRow(Plain):
     """Agreement over everybody."""
 
-    raw: Interval
-    cohen: Interval
+    raw: Estimate
+    cohen: Estimate
     """Mean over pairs of annotators with common queries."""
-    fleiss: Interval
-    krippendorff: Interval
-    intransitive: Interval
+    fleiss: Estimate
+    krippendorff: Estimate
+    intransitive: Estimate
     """Share of fully compared triads that go round in a circle."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -15,12 +15,13 @@ from sqlalchemy import Connection
 from prefrl.page import tallies
 from prefrl.page.api import AgreementRow, AnnotatorRow
 from prefrl.page.ledger import KINDS, SKIPPED, Ledger
-from prefrl.page.tallies import Mask, Rows, interval
-from prefrl.stats.intervals import Measured, share
+from prefrl.page.tallies import Mask, Rows
+from prefrl.stats.estimates import Estimate
+from prefrl.stats.intervals import share
 from prefrl.storage.tables import annotator, event
 from prefrl.storage.tables import query as asked
 
-ALONE = Measured(reason="nobody else judged what this person did")
+ALONE = Estimate(why="nobody else judged what this person did")
 EVENT = ("seq", "id", "kind", "subject", "actor", "body", "at")
 GROWTH = 1.01
 """By how much the log must have grown for agreement to be computed anew."""
@@ -54,7 +55,7 @@ class Dashboard:
     def __init__(self, fps: float | None = None, check_warn: float = 0.8, seed: int = 0) -> None:
         self._ledger, self._check_warn, self._seed = Ledger(fps), check_warn, seed
         self._sequence, self._agreed = 0, 0
-        self._agreement: tuple[AgreementRow, dict[int, Measured]] | None = None
+        self._agreement: tuple[AgreementRow, dict[int, Estimate]] | None = None
         self._seen: dict[str, str] = {}
         self._turn = threading.Lock()
 
@@ -95,7 +96,7 @@ class Dashboard:
             self._seen[name] = max(at, self._seen.get(name, ""))
         self._sequence = newest
 
-    def _agree(self, rows: Rows, keep: Mask) -> tuple[AgreementRow, dict[int, Measured]]:
+    def _agree(self, rows: Rows, keep: Mask) -> tuple[AgreementRow, dict[int, Estimate]]:
         """Agreement, as old as one percent of the log at most."""
         if self._agreement is None or self._sequence > GROWTH * self._agreed:
             rng = np.random.default_rng(self._seed)
@@ -103,7 +104,7 @@ class Dashboard:
             self._agreed = self._sequence
         return self._agreement
 
-    def _people(self, people: Sequence[Any], rows: Rows, stands: Mask, each: dict[int, Measured]) -> list[AnnotatorRow]:
+    def _people(self, people: Sequence[Any], rows: Rows, stands: Mask, each: dict[int, Estimate]) -> list[AnnotatorRow]:
         """A row for each of the store's annotators; trainers only read."""
         alive, same = stands.copy(), tallies.repeated(self._ledger)
         alive[[row for row, _, _ in self._ledger.repeats]] = True
@@ -119,8 +120,8 @@ class Dashboard:
                 role=one.role,
                 state=one.state,
                 last_seen=self._seen.get(one.name),
-                **asdict(person),
-                **{name: interval(measured) for name, measured in others.items()},
+                **vars(person),
+                **others,
             )
             found.append(made.model_copy(update={"concerns": tallies.concerns(made, self._check_warn)}))
         return found

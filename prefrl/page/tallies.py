@@ -5,7 +5,7 @@ Pure functions, but for `attention`, which reads the log.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
@@ -15,9 +15,10 @@ import sqlalchemy as sql
 from sqlalchemy import Connection
 
 from prefrl.judgements import Skip
-from prefrl.page.api import AgreementRow, AnnotatorRow, Interval
+from prefrl.page.api import AgreementRow, AnnotatorRow
 from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger, best
-from prefrl.stats.intervals import Measured, position_test, share
+from prefrl.stats.estimates import Estimate
+from prefrl.stats.intervals import position_test, share
 from prefrl.stats.raters import (
     Ratings,
     agreement_with_others,
@@ -53,9 +54,9 @@ class Person:
     skips: int
     median_seconds: float | None
     per_hour: float | None
-    left: Measured
-    ties: Measured
-    checks: Measured
+    left: Estimate
+    ties: Estimate
+    checks: Estimate
     too_fast: int
 
 
@@ -106,7 +107,7 @@ def repeated(ledger: Ledger) -> dict[int, tuple[int, int]]:
 
 def agreement(
     rows: Rows, pairs: Rows, keep: Mask, rng: np.random.Generator
-) -> tuple[AgreementRow, dict[int, Measured]]:
+) -> tuple[AgreementRow, dict[int, Estimate]]:
     """Agreement over everybody, and of each person with the others, on the rows (n,) to keep.
 
     Checks are too easy to count, and skips and "cannot be compared" say nothing of a pair. Krippendorff's alpha is
@@ -125,11 +126,11 @@ def agreement(
     edges = np.stack([pairs["one"][chosen], pairs["other"][chosen]], axis=1).astype(np.int64)
     two = edges[:, 0] >= 0
     found = AgreementRow(
-        raw=interval(raw_agreement(sides, rng, RESAMPLES)),
-        cohen=interval(cohen_kappa(sides, rng, RESAMPLES)),
-        fleiss=interval(fleiss_kappa(sides, rng, RESAMPLES)),
-        krippendorff=interval(krippendorff_alpha(graded, rng, "ordinal" if soft else "nominal", RESAMPLES)),
-        intransitive=interval(circular_triads(edges[two], preference[two], rng, RESAMPLES)),
+        raw=raw_agreement(sides, rng, RESAMPLES),
+        cohen=cohen_kappa(sides, rng, RESAMPLES),
+        fleiss=fleiss_kappa(sides, rng, RESAMPLES),
+        krippendorff=krippendorff_alpha(graded, rng, "ordinal" if soft else "nominal", RESAMPLES),
+        intransitive=circular_triads(edges[two], preference[two], rng, RESAMPLES),
     )
     each = agreement_with_others(sides, rng, RESAMPLES)
     return found, dict(zip(np.unique(who).tolist(), each, strict=True))
@@ -166,16 +167,11 @@ def concerns(row: AnnotatorRow, check_warn: float = 0.8) -> list[str]:
     return found
 
 
-def shortfall(name: str, rate: Interval | Measured, low: float) -> str:
+def shortfall(name: str, rate: Estimate, low: float) -> str:
     """In words, that what should be answered as expected surely is less often than that; "" where it may not be."""
     if rate.value is None or rate.high is None or rate.high >= low:
         return ""
     return f"{name} answered as expected: {rate.value:.0%} of {rate.count}, less than {low:.0%}"
-
-
-def interval(measured: Measured) -> Interval:
-    """As it goes over the wire."""
-    return Interval(**asdict(measured))
 
 
 def failing(connection: Connection, name: str, least: float) -> str:
@@ -183,7 +179,7 @@ def failing(connection: Connection, name: str, least: float) -> str:
     return shortfall("checks", attention(connection, name), least)
 
 
-def attention(connection: Connection, name: str) -> Measured:
+def attention(connection: Connection, name: str) -> Estimate:
     """The share of check questions that a person answered as expected since they were last let in; skips apart."""
     states = sql.select(sql.func.max(event.c.seq)).where(event.c.kind == "state", event.c.actor == name)
     since = connection.scalar(states) or 0

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from prefrl.evaluate.card import About, Bucket, Calibration, Estimate, LabelerPart, ReportCard
+from prefrl.evaluate.card import About, Bucket, Calibration, LabelerPart, ReportCard
 from prefrl.report.records import visible
 from prefrl.report.words import show_count, show_number, show_share, show_time
+from prefrl.stats.estimates import Estimate
 
 PERCENT = "\N{NO-BREAK SPACE}%"
 UNDEFINED = "not defined: "

@@ -6,41 +6,43 @@ that are alike is drawing how often each pattern comes up: that keeps large tabl
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from scipy import stats
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
+from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Floats, Integers
 
 RESAMPLES = 999
+CORRELATION_RESAMPLES = 199
+"""A rank correlation is sorted anew for each."""
 FEW = 5
 """With fewer units than this a bootstrap says nothing."""
 CHUNK = 4_000_000
 """Numbers that are drawn at once."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A number with its 95 % interval; or no number, and why."""
-
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    count: int = 0
-    """Items, answers or triads that it rests on."""
-    reason: str = ""
-    """Why the number, or its interval, is not there."""
+def wilson(share: float, count: int) -> tuple[float, float]:
+    """The 95 % interval of a proportion (Wilson 1927), ties as halves; honest for small counts, within 0 and 1."""
+    z = float(stats.norm.ppf(0.975))
+    centre = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    scale = 1 + z * z / count
+    # Rounding must not put the share itself outside, where it is 0 or 1.
+    return min(max((centre - half) / scale, 0.0), share), max(min((centre + half) / scale, 1.0), share)
 
 
-def share(hits: int, count: int, nothing: str = "nothing to count") -> Measured:
-    """hits / count with Wilson's interval (Wilson 1927); `nothing` says why there is none where count is 0."""
+def share(hits: int, count: int, nothing: str = "nothing to count") -> Estimate:
+    """hits / count with Wilson's interval; `nothing` says why there is none where count is 0."""
     if not count:
-        return Measured(reason=nothing)
-    interval = stats.binomtest(int(hits), int(count)).proportion_ci(method="wilson")
-    return Measured(hits / count, float(interval.low), float(interval.high), int(count))
+        return undefined(nothing)
+    low, high = wilson(hits / count, count)
+    return Estimate(value=hits / count, low=low, high=high, count=int(count), how="Wilson")
 
 
 def position_test(first: int, decided: int) -> float | None:
@@ -48,36 +50,44 @@ def position_test(first: int, decided: int) -> float | None:
     return float(stats.binomtest(int(first), int(decided), 0.5).pvalue) if decided else None
 
 
-def mean(hits: Floats, unit: Integers, rng: np.random.Generator, resamples: int = RESAMPLES) -> Measured:
-    """The mean of hits (n,) in [0, 1], n > 0; those of one unit (n,) are resampled together.
+def mean(
+    hits: Floats, unit: Integers, rng: np.random.Generator, resamples: int = RESAMPLES, what: str = "clusters"
+) -> Estimate:
+    """The mean of hits (n,) in [0, 1]; those of one unit (n,) hang together, and are resampled together.
 
-    Where all units have the same mean a bootstrap sees no spread, and Wilson's interval over units stands in.
+    Wilson's interval where every hit is a unit of its own. Where all units have the same mean a bootstrap sees no
+    spread, and Wilson's over the number of units stands in.
     """
+    if not len(hits):
+        return undefined("no comparison of this sort")
     rows, sizes = patterns(np.column_stack([hits, np.ones(len(hits))]), unit)
     value, units = float(hits.mean()), int(sizes.sum())
-    if units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0:  # (P,): the mean of each pattern of units
-        wilson = stats.binomtest(round(value * units), units).proportion_ci(method="wilson")
-        return Measured(value, min(float(wilson.low), value), max(float(wilson.high), value), len(hits))
-    sums = (weights @ rows for weights in draws(sizes, resamples, rng))  # (n, 2): hits, and how many there were
-    return defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Measured(count=len(hits)))
+    if units == len(hits) or (units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0):
+        low, high = wilson(value, units)
+        how = "Wilson" if units == len(hits) else f"Wilson over {units} {what}"
+        return Estimate(value=value, low=low, high=high, count=len(hits), how=how)
+    sums = (weights @ rows for weights in draws(sizes, resamples, rng))
+    found = defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Estimate(count=len(hits)), what)
+    return found if found.low is None else found.model_copy(update={"low": max(found.low, 0.0)})
 
 
-def defined(value: Floats, drawn: Iterator[Floats], units: int, found: Measured) -> Measured:
+def defined(value: Floats, drawn: Iterator[Floats], units: int, found: Estimate, what: str = "clusters") -> Estimate:
     """`found` with a value (1,) at most 1, and the percentiles of what was drawn; as it is where the value is NaN.
 
     The percentiles are shifted by the resamples' bias, so that they lie around the value.
     """
     if not np.isfinite(value[0]):
         return found
-    found = replace(found, value=float(value[0]), reason="")
+    found = found.model_copy(update={"value": float(value[0]), "why": ""})
     if units < FEW:
-        return replace(found, reason=f"no interval: there are only {units} to resample")
+        return found.model_copy(update={"how": f"no interval: only {units} {what}"})
     rows = np.concatenate(list(drawn))
-    rows = rows[np.isfinite(rows)]
+    rows = rows[np.isfinite(rows)]  # a resample can be one for which the measure is not defined
     if not len(rows) or np.ptp(rows) < 1e-12:
-        return replace(found, reason="no interval: resampling shows no spread")
+        return found.model_copy(update={"how": "no interval: resampling shows no spread"})
     low, high = np.percentile(rows, (2.5, 97.5)) + value[0] - rows.mean()
-    return replace(found, low=float(low), high=min(float(high), 1.0))
+    said = {"low": float(low), "high": min(float(high), 1.0), "how": f"bootstrap over {units} {what}"}
+    return found.model_copy(update=said)
 
 
 def patterns(parts: Floats, unit: Integers) -> tuple[Floats, Integers]:
@@ -114,3 +124,56 @@ def _chunks(total: int, width: int) -> Iterator[int]:
 def numbered(column: Integers) -> Integers:
     """(n,) the same distinctions, numbered from 0 in order."""
     return np.unique(column, return_inverse=True)[1].reshape(-1)
+
+
+def clusters(edges: Integers, group: Integers, candidates: int) -> tuple[Integers, str]:
+    """Which comparisons (M,) hang together, and in what sense: "comparisons", "components" or "judgements".
+
+    Comparisons that share a candidate, also by way of others, make one component. Where there are too few components
+    to resample, those of one judgement are kept together at least.
+    """
+    links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(candidates, candidates))
+    _, component = connected_components(links, directed=False)
+    of_edge = np.unique(component[edges[:, 0]], return_inverse=True)[1]
+    if len(np.unique(of_edge)) == len(edges):
+        return of_edge, "comparisons"
+    if len(np.unique(of_edge)) >= FEW:
+        return of_edge, "components"
+    return np.unique(group, return_inverse=True)[1], "judgements"
+
+
+def correlation(
+    kind: Literal["spearman", "pearson", "kendall"],
+    x: Floats,
+    y: Floats,
+    cluster: Sequence[object],
+    rng: np.random.Generator,
+) -> Estimate:
+    """A correlation of x (N,) and y (N,), with the percentiles of a bootstrap over clusters (N,).
+
+    Not defined where one of them is constant, or where there are fewer than three points.
+    """
+    value = correlate(kind, x, y)
+    if value is None:
+        return undefined(f"{len(x)} points" if len(x) < 3 else "all values are equal")
+    at = np.unique(np.array([str(c) for c in cluster]), return_inverse=True)[1]
+    members = np.split(np.argsort(at, kind="stable"), np.cumsum(np.bincount(at))[:-1])
+    if len(members) < FEW:
+        return Estimate(value=value, count=len(x), how=f"no interval: only {len(members)} clusters")
+    found = []
+    for _ in range(CORRELATION_RESAMPLES):
+        rows = np.concatenate([members[i] for i in rng.integers(len(members), size=len(members))])
+        found.append(correlate(kind, x[rows], y[rows]))
+    low, high = np.percentile([f for f in found if f is not None] or [np.nan], (2.5, 97.5))
+    if not np.isfinite(low):
+        return Estimate(value=value, count=len(x), how="no interval: resamples are constant")
+    return Estimate(value=value, low=low, high=high, count=len(x), how=f"bootstrap over {len(members)} clusters")
+
+
+def correlate(kind: Literal["spearman", "pearson", "kendall"], x: Floats, y: Floats) -> float | None:
+    """The correlation alone; None where it is not defined."""
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return None
+    measure: Any = {"spearman": stats.spearmanr, "pearson": stats.pearsonr, "kendall": stats.kendalltau}[kind]
+    value = float(measure(x, y).statistic)
+    return value if np.isfinite(value) else None

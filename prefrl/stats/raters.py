@@ -15,7 +15,8 @@ import numpy as np
 from scipy import stats
 from scipy.sparse import coo_array, csr_array
 
-from prefrl.stats.intervals import RESAMPLES, Measured, defined, draws, mean, numbered, patterns, resampled
+from prefrl.stats.estimates import Estimate
+from prefrl.stats.intervals import RESAMPLES, defined, draws, mean, numbered, patterns, resampled
 from prefrl.types import Floats, Integers
 
 MOST_CATEGORIES = 32
@@ -85,13 +86,13 @@ class Ratings:
         found[self.items] = numbered(self.units)
         return found
 
-    def lacking(self) -> Measured | None:
+    def lacking(self) -> Estimate | None:
         """Why there is no agreement to speak of; None where two raters share an item."""
         if not len(self.item):
-            return Measured(reason="there are no answers")
+            return Estimate(why="there are no answers")
         if not self.raters.any():
-            return Measured(reason="there is only one rater")
-        return None if (self.counts.sum(1) > 1).any() else Measured(reason="no item was judged by two raters")
+            return Estimate(why="there is only one rater")
+        return None if (self.counts.sum(1) > 1).any() else Estimate(why="no item was judged by two raters")
 
 
 def entropies(ratings: Ratings) -> Floats:
@@ -104,7 +105,7 @@ def entropies(ratings: Ratings) -> Floats:
 # --- agreement -----------------------------------------------------------------------------------------------------
 
 
-def raw_agreement(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Measured:
+def raw_agreement(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Estimate:
     """How often two raters of one item say the same: the mean over items with two answers or more.
 
     Where all items agree alike a bootstrap sees no spread, and Wilson's interval over items stands in.
@@ -115,7 +116,7 @@ def raw_agreement(ratings: Ratings, rng: np.random.Generator, resamples: int = R
     return mean(_alike(counts), unit, rng, resamples)
 
 
-def agreement_with_others(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> list[Measured]:
+def agreement_with_others(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> list[Estimate]:
     """For each rater, in the order of `rater`: the mean, over items, of the share of the others who say the same."""
     if not len(ratings.item):
         return []
@@ -123,11 +124,11 @@ def agreement_with_others(ratings: Ratings, rng: np.random.Generator, resamples:
     same = (ratings.counts[ratings.items, ratings.values] - 1) / np.maximum(others, 1)
     shared, unit = others > 0, ratings.unit_of_item[ratings.items]
     rows = [shared & (ratings.raters == rater) for rater in range(int(ratings.raters.max()) + 1)]
-    alone = Measured(reason="nobody else judged what this rater did")
+    alone = Estimate(why="nobody else judged what this rater did")
     return [mean(same[keep], unit[keep], rng, resamples) if keep.any() else alone for keep in rows]
 
 
-def fleiss_kappa(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Measured:
+def fleiss_kappa(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Estimate:
     """Fleiss' kappa (Fleiss 1971), over items with two answers or more.
 
     Items may differ in their number of answers: an item's agreement is over its own pairs of answers, a category's
@@ -145,7 +146,7 @@ def krippendorff_alpha(
     rng: np.random.Generator,
     level: Literal["nominal", "ordinal"] = "nominal",
     resamples: int = RESAMPLES,
-) -> Measured:
+) -> Estimate:
     """Krippendorff's alpha (Krippendorff 2011, "Computing Krippendorff's Alpha-Reliability"); answers may be missing.
 
     The interval resamples items, where Krippendorff resamples pairs of answers: those to one item hang together.
@@ -161,7 +162,7 @@ def krippendorff_alpha(
     return _beyond_chance(coincidences, unit, lambda sums: measure(sums.reshape(-1, size, size)), rng, resamples)
 
 
-def cohen_kappa(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Measured:
+def cohen_kappa(ratings: Ratings, rng: np.random.Generator, resamples: int = RESAMPLES) -> Estimate:
     """Cohen's kappa (Cohen 1960): the mean over pairs of raters, each weighted with its number of common items.
 
     Where everybody judged everything that is the plain mean of Light (1971). Left out are pairs that always say one
@@ -171,17 +172,17 @@ def cohen_kappa(ratings: Ratings, rng: np.random.Generator, resamples: int = RES
         return lacking
     many = ratings.counts.sum(1)
     if (pairings := int((many * (many - 1)).sum() // 2)) > MOST_PAIRINGS:
-        return Measured(reason=f"{pairings} pairs of answers to one item are too many to go through")
+        return Estimate(why=f"{pairings} pairs of answers to one item are too many to go through")
     tables, items, size = _contingency(ratings)
     if not tables.shape[1]:
-        return Measured(reason=f"no two raters judged {COMMON} items in common")
+        return Estimate(why=f"no two raters judged {COMMON} items in common")
 
     def measure(sums: Floats) -> Floats:
         return _mean_kappa(sums.reshape(len(sums), -1, size, size))
 
     weights = resampled(*tables.shape, resamples, rng)
     drawn = (measure(np.asarray(some @ tables, np.float64)) for some in weights)
-    found = Measured(count=items, reason=ALIKE)
+    found = Estimate(count=items, why=ALIKE)
     return defined(measure(np.asarray(tables.sum(0), np.float64)[None]), drawn, tables.shape[0], found)
 
 
@@ -198,11 +199,11 @@ def cohen(one: Integers, other: Integers) -> float | None:
 
 def _beyond_chance(
     parts: Floats, unit: Integers, measure: Callable[[Floats], Floats], rng: np.random.Generator, resamples: int
-) -> Measured:
+) -> Estimate:
     """A measure of the sums (B, D) of each item's parts (Q, D)."""
     rows, sizes = patterns(parts, unit)
     drawn = (measure(weights @ rows) for weights in draws(sizes, resamples, rng))
-    found = Measured(count=len(parts), reason=ALIKE)
+    found = Estimate(count=len(parts), why=ALIKE)
     return defined(measure(np.asarray(parts.sum(0, keepdims=True), np.float64)), drawn, int(sizes.sum()), found)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from prefrl.stats.intervals import RESAMPLES, Measured, mean
+from prefrl.stats.estimates import Estimate
+from prefrl.stats.intervals import RESAMPLES, mean
 from prefrl.types import Floats, Integers
 
 MOST_TRIADS = 200_000
@@ -15,7 +16,7 @@ MOST_TRIADS = 200_000
 
 def circular_triads(
     edges: Integers, preference: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
-) -> Measured:
+) -> Estimate:
     """How many of three candidates, each compared with both others, go round in a circle (Kendall and Smith 1940).
 
     edges (M, 2) name candidates, preference (M,) is for the first; repeated comparisons are added up, and those that
@@ -25,7 +26,7 @@ def circular_triads(
     edges, sign = _net(edges, preference)
     triads = _triads(edges, rng)
     if not len(triads):
-        return Measured(reason="no three candidates were all compared with one another")
+        return Estimate(why="no three candidates were all compared with one another")
     # Of a < b < c: around a circle a beats b, b beats c and c beats a, or the other way round.
     ab, ac, bc = sign[triads].T
     around = (ab == bc) & (ab != ac)

@@ -59,4 +59,4 @@ def test_what_is_new_in_the_log_is_followed(labelled: Store[Response]) -> None:
 def test_an_empty_store_has_figures(text_store: Store[Response]) -> None:
     found = figures(text_store, Dashboard(fps=20.0))
     assert (found.asked, found.open, found.annotators, found.flags) == (0, 0, [], [])
-    assert found.agreement.cohen.reason == "there are no answers"
+    assert found.agreement.cohen.why == "there are no answers"

@@ -79,7 +79,7 @@ def test_nothing_is_defined_of_somebody_who_did_nothing(made: Made) -> None:
     made.ask()
     found = made.person("ann")
     assert (found.answers, found.skips, found.median_seconds, found.per_hour) == (0, 0, None, None)
-    reasons = [found.left.reason, found.ties.reason, found.checks.reason]
+    reasons = [found.left.why, found.ties.why, found.checks.why]
     assert reasons == ["no pair was decided", "no pair was judged", "no check question was answered"]
 
 
@@ -123,11 +123,11 @@ def test_speed_leaves_pauses_out() -> None:
 
 def row_of(made: Made, name: str, rng: Generator) -> AnnotatorRow:
     ledger = made.ledger()
-    same = tallies.interval(share(*tallies.repeated(ledger).get(ledger.people[name], (0, 0))))
-    each = tallies.interval(made.agreement(rng)[1][ledger.people[name]])
+    same = share(*tallies.repeated(ledger).get(ledger.people[name], (0, 0)))
+    each = made.agreement(rng)[1][ledger.people[name]]
     more: Any = vars(made.person(name)) | {"left": None, "ties": None, "checks": None}
     for part in ("left", "ties", "checks"):
-        more[part] = tallies.interval(getattr(made.person(name), part))
+        more[part] = getattr(made.person(name), part)
     return AnnotatorRow(
         name=name, role="annotator", state="active", repeats=same, agreement=each, last_seen=None, **more
     )
@@ -189,7 +189,7 @@ def test_unanimous_people_agree_fully_and_kappas_say_why_they_are_missing(made: 
     assert everybody.raw.value == 1.0
     for found in (everybody.cohen, everybody.fleiss, everybody.krippendorff):
         assert found.value is None
-        assert "alike" in found.reason
+        assert "alike" in found.why
     assert [m.value for m in each.values()] == [1.0, 1.0]
 
 
@@ -198,14 +198,14 @@ def test_a_single_person_agrees_with_nobody(made: Made, rng: Generator) -> None:
     sweep(made, "alone", lambda i: float(i % 2))
     everybody, each = made.agreement(rng)
     for found in (everybody.raw, everybody.cohen, everybody.fleiss, everybody.krippendorff):
-        assert (found.value, found.reason) == (None, "there is only one rater")
-    assert "nobody else" in next(iter(each.values())).reason
+        assert (found.value, found.why) == (None, "there is only one rater")
+    assert "nobody else" in next(iter(each.values())).why
     assert everybody.intransitive.value is None
 
 
 def test_an_empty_log_has_figures_without_numbers(made: Made, rng: Generator) -> None:
     everybody, each = made.agreement(rng)
-    assert (everybody.raw.reason, each) == ("there are no answers", {})
+    assert (everybody.raw.why, each) == ("there are no answers", {})
 
 
 # --- between people ------------------------------------------------------------------------------------------------

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from linear_reward import LinearReward, segment
 
-from prefrl.evaluate.card import Bucket, ReportCard, undefined
+from prefrl.evaluate.card import Bucket, ReportCard
 from prefrl.evaluate.grade import Subject, grade
 from prefrl.judgements import Comparison, Judged
 from prefrl.report.card_words import groups, headline, span
 from prefrl.report.records import read
 from prefrl.report.report import render_card, write_report
+from prefrl.stats.estimates import undefined
 from prefrl.types import Query, Response
 
 WILD = "</bdi></td><script>alert(1)</script>\u202e\x1b{{ 7*7 }}"

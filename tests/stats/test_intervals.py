@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from prefrl.evaluate.calibration import wilson
-from prefrl.evaluate.intervals import clusters, correlate, correlation, share
+from prefrl.stats.intervals import clusters, correlate, correlation, mean, wilson
 
 
 def test_comparisons_that_share_a_candidate_hang_together() -> None:
@@ -24,7 +23,7 @@ def test_one_big_component_falls_back_to_judgements() -> None:
 
 
 def test_independent_hits_get_wilsons_interval(rng: np.random.Generator) -> None:
-    found = share(np.array([1.0] * 8 + [0.0] * 2), np.arange(10), rng)
+    found = mean(np.array([1.0] * 8 + [0.0] * 2), np.arange(10), rng)
     assert found.value == 0.8
     assert (found.low, found.high) == pytest.approx(wilson(0.8, 10))
     assert (found.count, found.how) == (10, "Wilson")
@@ -32,8 +31,8 @@ def test_independent_hits_get_wilsons_interval(rng: np.random.Generator) -> None
 
 def test_hits_that_hang_together_get_a_wider_interval(rng: np.random.Generator) -> None:
     right = rng.random(60) < 0.7
-    alone = share(right.astype(float), np.arange(60), rng)
-    tenfold = share(np.repeat(right, 10).astype(float), np.repeat(np.arange(60), 10), rng)
+    alone = mean(right.astype(float), np.arange(60), rng)
+    tenfold = mean(np.repeat(right, 10).astype(float), np.repeat(np.arange(60), 10), rng)
     assert tenfold.low is not None
     assert tenfold.high is not None
     assert (tenfold.low, tenfold.high) == pytest.approx((alone.low, alone.high), abs=0.03)
@@ -45,7 +44,7 @@ def test_the_bootstrap_has_the_standard_error_of_a_mean_of_clusters() -> None:
     rng = np.random.default_rng(3)
     sizes = rng.integers(1, 6, 200)
     hits = np.concatenate([np.full(n, float(rng.random() < 0.6)) for n in sizes])
-    found = share(hits, np.repeat(np.arange(200), sizes), rng)
+    found = mean(hits, np.repeat(np.arange(200), sizes), rng)
     residual = np.bincount(np.repeat(np.arange(200), sizes), hits - hits.mean())
     error = np.sqrt((residual**2).sum()) / len(hits)  # the linearised error of a ratio
     assert found.low is not None
@@ -54,14 +53,14 @@ def test_the_bootstrap_has_the_standard_error_of_a_mean_of_clusters() -> None:
 
 
 def test_agreeing_clusters_never_give_an_interval_of_no_width(rng: np.random.Generator) -> None:
-    found = share(np.ones(12), np.repeat(np.arange(6), 2), rng)
+    found = mean(np.ones(12), np.repeat(np.arange(6), 2), rng)
     assert (found.low, found.high) == pytest.approx(wilson(1.0, 6))
     assert found.how == "Wilson over 6 clusters"
 
 
 def test_what_cannot_be_known_is_said_and_not_made_up(rng: np.random.Generator) -> None:
-    assert share(np.zeros(0), np.zeros(0, int), rng).why == "no comparison of this sort"
-    few = share(np.array([1.0, 0.0, 1.0]), np.array([0, 0, 1]), rng)
+    assert mean(np.zeros(0), np.zeros(0, int), rng).why == "no comparison of this sort"
+    few = mean(np.array([1.0, 0.0, 1.0]), np.array([0, 0, 1]), rng)
     assert (few.low, few.how) == (None, "no interval: only 2 clusters")
     flat = correlation("spearman", np.ones(9), np.arange(9.0), range(9), rng)
     assert (flat.value, flat.why) == (None, "all values are equal")

@@ -13,7 +13,8 @@ from scipy import stats
 from statsmodels.stats import inter_rater
 from statsmodels.stats.proportion import proportion_confint
 
-from prefrl.stats.intervals import Measured, mean, position_test, share
+from prefrl.stats.estimates import Estimate
+from prefrl.stats.intervals import mean, position_test, share
 from prefrl.stats.raters import (
     Ratings,
     agreement_with_others,
@@ -27,7 +28,7 @@ from prefrl.stats.raters import (
 from prefrl.types import Floats
 
 Generator = np.random.Generator
-MEASURES: list[Callable[..., Measured]] = [
+MEASURES: list[Callable[..., Estimate]] = [
     raw_agreement,
     cohen_kappa,
     fleiss_kappa,
@@ -109,7 +110,7 @@ def test_pairs_of_raters_with_few_common_items_have_no_say_in_the_mean(rng: Gene
     table[0, :20] = table[1, :20] = np.arange(20) % 2
     table[2, :9] = 1 - np.arange(9) % 2
     assert cohen_kappa(ratings(table), rng).value == 1.0
-    assert cohen_kappa(ratings(table[[0, 2]]), rng).reason == "no two raters judged 10 items in common"
+    assert cohen_kappa(ratings(table[[0, 2]]), rng).why == "no two raters judged 10 items in common"
 
 
 def test_raw_agreement_counts_each_item_once(rng: Generator) -> None:
@@ -128,7 +129,7 @@ def test_each_rater_is_compared_with_the_others(rng: Generator) -> None:
     assert odd.value == 0.0
     assert last.value == pytest.approx(2 / 3)
     alone = agreement_with_others(ratings([[0, 1], [np.nan, np.nan]]), rng)
-    assert [m.reason for m in alone] == ["nobody else judged what this rater did"]
+    assert [m.why for m in alone] == ["nobody else judged what this rater did"]
 
 
 def test_entropy_is_in_bits() -> None:
@@ -146,23 +147,23 @@ def test_entropy_is_in_bits() -> None:
     ],
 )
 def test_what_cannot_be_measured_says_why(
-    rng: Generator, measure: Callable[..., Measured], table: Any, reason: str
+    rng: Generator, measure: Callable[..., Estimate], table: Any, reason: str
 ) -> None:
-    assert measure(ratings(table), rng) == Measured(reason=reason)
+    assert measure(ratings(table), rng) == Estimate(why=reason)
 
 
 @pytest.mark.parametrize("measure", MEASURES[1:])
-def test_unanimous_answers_leave_nothing_beyond_chance(rng: Generator, measure: Callable[..., Measured]) -> None:
+def test_unanimous_answers_leave_nothing_beyond_chance(rng: Generator, measure: Callable[..., Estimate]) -> None:
     found = measure(ratings(np.ones((3, 40))), rng)
     assert (found.value, found.low, found.high) == (None, None, None)
-    assert "alike" in found.reason
+    assert "alike" in found.why
     raw = raw_agreement(ratings(np.ones((3, 40))), rng)
     assert (raw.value, raw.high) == (1.0, 1.0)
     assert raw.low == pytest.approx(proportion_confint(40, 40, method="wilson")[0])
 
 
 @pytest.mark.parametrize("measure", MEASURES)
-def test_intervals_cover_the_value_that_much_data_would_give(rng: Generator, measure: Callable[..., Measured]) -> None:
+def test_intervals_cover_the_value_that_much_data_would_give(rng: Generator, measure: Callable[..., Estimate]) -> None:
     truth = measure(ratings(noisy(rng, 3, 40_000)), rng, resamples=1).value
     assert truth is not None
     found = [measure(ratings(noisy(rng, 3, 80)), rng, resamples=199) for _ in range(100)]
@@ -178,7 +179,7 @@ def test_an_interval_leaves_out_a_fortieth_on_either_side(rng: Generator) -> Non
 
 
 @pytest.mark.parametrize("measure", MEASURES)
-def test_numbers_hang_on_the_seed_alone(measure: Callable[..., Measured]) -> None:
+def test_numbers_hang_on_the_seed_alone(measure: Callable[..., Estimate]) -> None:
     table = noisy(np.random.default_rng(3), 4, 50, missing=0.2)
     once, again = (measure(ratings(table), np.random.default_rng(5)) for _ in range(2))
     assert once == again
@@ -200,7 +201,7 @@ def test_every_number_is_finite_or_missing_with_a_reason(answers: list[tuple[int
         numbers = [n for n in (one.value, one.low, one.high) if n is not None]
         assert np.isfinite(numbers).all()
         assert max(numbers, default=0) <= 1
-        assert len(numbers) == 3 or one.reason
+        assert len(numbers) == 3 or one.why or one.how
     assert np.isfinite(entropies(some)).all()
 
 
@@ -219,9 +220,9 @@ def test_items_of_one_cluster_are_resampled_together(rng: Generator) -> None:
 def test_few_items_have_a_value_and_no_interval(rng: Generator) -> None:
     found = fleiss_kappa(ratings([[0, 1, 1], [0, 1, 0]]), rng)
     assert found.value is not None
-    assert (found.low, found.reason) == (None, "no interval: there are only 3 to resample")
+    assert (found.low, found.how) == (None, "no interval: only 3 clusters")
     spread = krippendorff_alpha(ratings([[0, 1] * 10] * 2), rng)
-    assert (spread.value, spread.low, spread.reason) == (1.0, None, "no interval: resampling shows no spread")
+    assert (spread.value, spread.low, spread.how) == (1.0, None, "no interval: resampling shows no spread")
 
 
 def test_ratings_that_make_no_sense_are_refused() -> None:
@@ -238,11 +239,11 @@ def test_shares_have_the_wilson_interval_of_the_reference() -> None:
     found = share(17, 40)
     assert (found.low, found.high) == pytest.approx(proportion_confint(17, 40, method="wilson"))
     assert (found.value, found.count) == (17 / 40, 40)
-    assert share(0, 0, "nobody came") == Measured(reason="nobody came")
+    assert share(0, 0, "nobody came") == Estimate(why="nobody came")
 
 
 def test_means_of_few_and_of_equal_things(rng: Generator) -> None:
-    assert mean(np.array([0.0, 1.0]), np.arange(2), rng).reason == "no interval: there are only 2 to resample"
+    assert mean(np.array([0.0, 1.0, 1.0]), np.array([0, 0, 1]), rng).how == "no interval: only 2 clusters"
     flat = mean(np.full(50, 0.5), np.arange(50), rng)
     assert (flat.low, flat.high) == pytest.approx(proportion_confint(25, 50, method="wilson"))
 

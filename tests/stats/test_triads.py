@@ -48,7 +48,7 @@ def test_triads_that_share_a_comparison_are_no_independent_evidence(rng: Generat
     edges = np.array(list(combinations(range(12), 2)))
     found = circular_triads(edges, rng.integers(2, size=len(edges)).astype(np.float64), rng)
     assert found.count == 220
-    assert (found.low, found.reason) == (None, "no interval: there are only 1 to resample")
+    assert (found.low, found.how) == (None, "no interval: only 1 clusters")
 
 
 def test_many_triads_are_sampled_evenly(rng: Generator, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,4 +64,4 @@ def test_many_triads_are_sampled_evenly(rng: Generator, monkeypatch: pytest.Monk
 @pytest.mark.parametrize("edges", [np.zeros((0, 2), int), np.array([[0, 1], [1, 2]]), np.array([[0, 1], [0, 2]])])
 def test_without_triads_there_is_nothing_to_say(rng: Generator, edges: np.ndarray) -> None:
     found = circular_triads(edges, np.ones(len(edges)), rng)
-    assert (found.value, found.reason) == (None, "no three candidates were all compared with one another")
+    assert (found.value, found.why) == (None, "no three candidates were all compared with one another")

@@ -8,13 +8,13 @@ import { toast } from "./toast.js";
 const BAR = 64;
 
 /** A number with its interval drawn beside it, or a dash with the reason. */
-export function interval({ value, low, high, count, reason }, { percent = true, middle = 0.5 } = {}) {
+export function interval({ value, low, high, count, why }, { percent = true, middle = 0.5 } = {}) {
   if (value === null || value === undefined)
     return el(
       "span",
-      { class: "undefined", title: reason || t("people.none") },
+      { class: "undefined", title: why || t("people.none") },
       "–",
-      el("span", { class: "sr-only", text: ` ${reason}` }),
+      el("span", { class: "sr-only", text: ` ${why}` }),
     );
   const shown = (number) => (percent ? `${Math.round(100 * number)}%` : number.toFixed(2));
   const range = low === null || low === undefined ? "" : t("people.range", { low: shown(low), high: shown(high) });
