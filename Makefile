@@ -13,7 +13,7 @@ SEED := $(shell od -An -N4 -tu4 /dev/urandom | tr -d ' ')
 endif
 export SEED
 
-.PHONY: demo test reading running lint types layers unit slow browser long docs cover budget nightly peers clean
+.PHONY: demo test reading running lint types layers unit slow browser long docs cover budget nightly mutants peers clean
 
 demo: .venv/demo
 	$(BIN)/prefrl run control/pendulum --out runs/pendulum
@@ -61,8 +61,12 @@ browser: .venv/dev
 long: .venv/dev
 	$(PYTEST) -m "slow or browser"
 
-nightly: .venv/dev
+nightly: .venv/dev mutants
 	$(PYTEST) -m nightly
+
+# Breaks the product in one place at a time: do the tests notice?
+mutants: .venv/dev
+	.ci/in_memory $(BIN)/python tests/mutants/mutate.py
 
 cover: .venv/dev
 	$(PYTEST) --cov --cov-report=term
