@@ -21,7 +21,7 @@ from prefrl.storage.arrivals import Merged, check_arrivals
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.events import ANSWER_TYPES, describe, load_candidate, read_answer
 from prefrl.storage.log import EventLog, StoreError, Transaction, row
-from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
+from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, bodies, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
 from prefrl.types import C, Candidate, Floats, Query, Segment
@@ -226,11 +226,8 @@ class Store(Generic[C]):
 
     def _bodies(self, ids: Sequence[str], kind: str) -> dict[str, Any]:
         """What was said of queries or candidates when they were asked."""
-        found: dict[str, Any] = {}
         with self.log.reading() as connection:
-            for some in chunks(ids, CHUNK):
-                chosen = sql.select(event.c.id, event.c.body).where(event.c.id.in_(some), event.c.kind == kind)
-                found |= {one.id: one.body for one in connection.execute(chosen)}
+            found = bodies(connection, ids)
         if missing := [id for id in ids if id not in found]:
             raise StoreError(f"the store in {self.folder} holds no {kind} {missing[0][:12]}")
         return found

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from jinja2 import TemplateError
 from torch import Tensor
-from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
+from transformers import AutoModel, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.models.auto.modeling_auto import MODEL_FOR_MASKED_LM_MAPPING_NAMES
-from transformers.utils.logging import (
-    disable_progress_bar,
-    enable_progress_bar,
-    get_verbosity,
-    is_progress_bar_enabled,
-    set_verbosity,
-    set_verbosity_error,
-)
 
 from prefrl.components import ConfigError
 from prefrl.exchange.transcripts import prompt_messages, response_messages
+from prefrl.policies.pretrained import first_line, load_tokenizer, load_weights
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
 from prefrl.seeding import to_numpy
@@ -153,7 +145,9 @@ def of_policy(task: TextTask, chat: bool) -> Backbone:
 
 def of_folder(name: str, task: TextTask, download: bool, pool: Literal["first", "mean"], chat: bool) -> Backbone:
     """A model of transformers by folder or name. Raises `ConfigError` where it cannot be used."""
-    return _ready(load_weights(AutoModel, name, download), load_tokenizer(name, download), task, pool, chat)
+    return _ready(
+        load_weights(AutoModel, name, download, "reward.download"), load_tokenizer(name, download), task, pool, chat
+    )
 
 
 def of_classifier(model: Any, head: str, tokenizer: PreTrainedTokenizerBase, task: TextTask, chat: bool) -> Backbone:
@@ -192,40 +186,6 @@ def _after_padding(model: PreTrainedModel) -> list[int]:
     return [m.num_embeddings - start - 1 for m, start in starts if start is not None]
 
 
-def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
-    """Float32, from safetensors alone and without anybody's code. Raises `ConfigError` where weights are missing."""
-    where = {"local_files_only": not download, "trust_remote_code": False}
-    try:
-        with quiet():
-            model, info = auto.from_pretrained(
-                name, dtype=torch.float32, use_safetensors=True, output_loading_info=True, **where
-            )
-    except (OSError, ValueError) as error:
-        hint = first_line(error) if download else "only local files are looked at unless reward.download is true"
-        raise ConfigError(f"no model in safetensors could be read from {name!r}: {hint}") from error
-    headless = auto is AutoModel  # then nothing reads a pooler
-    # transformers fills what is missing with random numbers and only warns.
-    if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
-        raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
-    found: PreTrainedModel = model
-    return found
-
-
-def load_tokenizer(name: str, download: bool) -> PreTrainedTokenizerBase:
-    try:
-        found: PreTrainedTokenizerBase = AutoTokenizer.from_pretrained(
-            name, local_files_only=not download, trust_remote_code=False
-        )
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"no tokenizer could be read from {name!r}: {first_line(error)}") from error
-    return found
-
-
-def first_line(error: Exception) -> str:
-    """What went wrong; the advice that libraries add is for others."""
-    return str(error).strip().partition("\n")[0]
-
-
 def trainable(backbone: Backbone, train: Train) -> dict[str, torch.nn.Parameter]:
     """What a fit changes, by name."""
     if train == "head":
@@ -241,17 +201,3 @@ def digest(named: Mapping[str, Tensor]) -> str:
         # As bytes, since NumPy has no bfloat16.
         found.update(to_numpy(value.detach().contiguous().view(torch.uint8)).tobytes())
     return found.hexdigest()
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep transformers from drawing bars, and from reporting on the head that is left out."""
-    shown, verbosity = is_progress_bar_enabled(), get_verbosity()
-    disable_progress_bar()  # type: ignore[no-untyped-call]
-    set_verbosity_error()  # type: ignore[no-untyped-call]
-    try:
-        yield
-    finally:
-        set_verbosity(verbosity)
-        if shown:
-            enable_progress_bar()  # type: ignore[no-untyped-call]

@@ -10,15 +10,13 @@ import torch
 from transformers import AutoModelForSequenceClassification, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
+from prefrl.policies.pretrained import load_tokenizer, load_weights, quiet
 from prefrl.protocols import TextTask
 from prefrl.reward_models.backbone import (
     Backbone,
     end_token,
     is_encoder,
-    load_tokenizer,
-    load_weights,
     of_classifier,
-    quiet,
 )
 from prefrl.reward_models.packing import ATTENTION
 from prefrl.storage.files import whole_folder
@@ -36,7 +34,7 @@ def load_classifier(
     label, and is a causal model with one linear head on the last token or an encoder that ends in one linear layer,
     whatever it has before that.
     """
-    model: Any = load_weights(AutoModelForSequenceClassification, name, download)
+    model: Any = load_weights(AutoModelForSequenceClassification, name, download, "reward.download")
     if model.config.num_labels != 1:
         raise ConfigError(f"{name} tells {model.config.num_labels} labels apart; a reward model has num_labels=1")
     path, tokenizer = _last_layer(model, name), load_tokenizer(name, download)

@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from pydantic import Field, field_validator
 from torch import Tensor
-from transformers import AutoModelForCausalLM, AutoTokenizer, GenerationConfig, PreTrainedTokenizerBase
+from transformers import AutoModelForCausalLM, GenerationConfig, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError, Settings
 from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.label.prompts import Prompter, answer_tokens, verdict
+from prefrl.policies.pretrained import load_tokenizer, load_weights
 from prefrl.protocols import Store, Task, TextTask
 from prefrl.types import C, Floats, Integers, Metrics, Query, Response
 
@@ -87,20 +88,11 @@ class JudgeSettings(Settings):
 
 
 def _load(settings: JudgeSettings) -> tuple[Any, PreTrainedTokenizerBase]:
-    """A model in float32 with dropout off; weights in safetensors only, and no code of the model's own."""
-    local = not settings.download
     try:
-        tokenizer = AutoTokenizer.from_pretrained(settings.model, local_files_only=local)
-        model = AutoModelForCausalLM.from_pretrained(
-            settings.model, dtype=torch.float32, local_files_only=local, use_safetensors=True
-        )
-    except (OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        hint = "name a folder that holds one, or set labeler.download=true" if local else "check the name"
-        raise ConfigError(
-            f"labeler.model: no causal model could be read from {settings.model!r} ({reason}); {hint}"
-        ) from error
-    return model, tokenizer
+        model = load_weights(AutoModelForCausalLM, settings.model, settings.download, "labeler.download")
+        return model, load_tokenizer(settings.model, settings.download)
+    except ConfigError as error:
+        raise ConfigError(f"labeler.model: {error}") from error
 
 
 @dataclass(frozen=True)

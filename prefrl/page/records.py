@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 from prefrl.page.api import HISTORY
 from prefrl.page.desk import REMEMBERED
 from prefrl.page.questions import BETWEEN, Given, Past, Question
-from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, RETRACTED, chunks
+from prefrl.storage.projection import ANSWERS, JUDGEMENTS, RETRACTED, bodies
 from prefrl.storage.tables import assignment, event, query, setting, standing
 
 done = query.c.judged + query.c.incomparable
@@ -148,8 +148,8 @@ def as_sent(body: dict[str, Any]) -> dict[str, Any]:
 
 def candidates(connection: Connection, queries: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
     """Of each query its candidates as the log describes them, each with its `id`."""
-    asked = {id: body["candidates"] for id, body in _bodies(connection, queries).items()}
-    described = _bodies(connection, [c for ids in asked.values() for c in ids])
+    asked = {id: body["candidates"] for id, body in bodies(connection, queries).items()}
+    described = bodies(connection, [c for ids in asked.values() for c in ids])
     return {id: [described[c] | {"id": c} for c in ids] for id, ids in asked.items()}
 
 
@@ -188,14 +188,6 @@ def judgements_after(connection: Connection, seq: int, limit: int) -> list[dict[
     trains = sql.exists().where(query.c.id == event.c.subject, query.c.purpose == "label")
     some = sql.select(*columns).where(event.c.seq > seq, event.c.kind.in_((*ANSWERS, "retract")), trains)
     return [dict(row._mapping) for row in connection.execute(some.order_by(event.c.seq).limit(limit))]
-
-
-def _bodies(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for some in chunks(dict.fromkeys(ids), CHUNK):
-        rows = connection.execute(sql.select(event.c.id, event.c.body).where(event.c.id.in_(some)))
-        found |= {row.id: row.body for row in rows}
-    return found
 
 
 def _count(connection: Connection, wanted: sql.ColumnElement[bool]) -> int:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import tokenizers
@@ -26,9 +26,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from torch import Tensor
 from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
-from transformers.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 
 from prefrl.components import Settings
+from prefrl.policies.pretrained import load_weights, quiet
 from prefrl.seeding import draw_seed
 from prefrl.storage.files import DamagedError, verify, whole_folder
 
@@ -95,31 +95,15 @@ class CloningSettings(Settings):
 
 def _make(settings: CloningSettings, write: Writer, folder: Path) -> None:
     model, tokenizer = clone(settings, write)
-    with whole_folder(folder) as work, _quiet():
+    with whole_folder(folder) as work, quiet():
         model.save_pretrained(work)
         tokenizer.save_pretrained(work)
 
 
 def _load(folder: Path) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
     verify(folder)  # the name says what went in, not whether all of it is still there
-    with _quiet():
-        model = LlamaForCausalLM.from_pretrained(
-            folder, dtype=torch.float32, local_files_only=True, use_safetensors=True
-        )
-    model.eval()  # type: ignore[no-untyped-call]
+    model: Any = load_weights(LlamaForCausalLM, folder, download=False)
     return model, PreTrainedTokenizerFast.from_pretrained(folder, local_files_only=True)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep transformers from drawing bars over a few files."""
-    shown = is_progress_bar_enabled()
-    disable_progress_bar()  # type: ignore[no-untyped-call]
-    try:
-        yield
-    finally:
-        if shown:
-            enable_progress_bar()  # type: ignore[no-untyped-call]
 
 
 def clone(settings: CloningSettings, write: Writer) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:

@@ -108,6 +108,15 @@ def chunks(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
         yield some
 
 
+def bodies(connection: Connection, ids: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """What was said of queries and candidates when they were asked, by id; those that nobody asked are missing."""
+    found: dict[str, dict[str, Any]] = {}
+    for some in chunks(dict.fromkeys(ids), CHUNK):
+        chosen = event.c.id.in_(some) & event.c.kind.in_(("query", "candidate"))
+        found |= {one.id: one.body for one in connection.execute(sql.select(event.c.id, event.c.body).where(chosen))}
+    return found
+
+
 def words(connection: Connection, keys: Iterable[tuple[str, str]]) -> dict[tuple[str, str], dict[str, Any]]:
     """(query, labeler) -> the newest word there, for those that have said any."""
     found: dict[tuple[str, str], dict[str, Any]] = {}

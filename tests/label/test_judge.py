@@ -302,7 +302,7 @@ def test_the_starting_policy_judges_when_no_model_is_named(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"model": "/no/such/folder"}, "no causal model could be read"),
+        ({"model": "/no/such/folder"}, "no model in safetensors could be read"),
         ({"answers": ("good film", "B")}, "no single token"),
         ({"answers": ("A", "A")}, "expected two that differ"),
     ],

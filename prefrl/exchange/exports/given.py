@@ -19,7 +19,7 @@ from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.storage.events import load_candidate, read_answer
 from prefrl.storage.files import make_folder, sync_folder
 from prefrl.storage.log import StoreError
-from prefrl.storage.projection import ANSWERS, CHUNK, all_events, chunks, words
+from prefrl.storage.projection import ANSWERS, CHUNK, all_events, bodies, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
 from prefrl.store import Store
@@ -118,20 +118,10 @@ def _standing(connection: sql.Connection) -> Iterator[list[dict[str, Any]]]:
 
 def stored_queries(connection: sql.Connection, ids: Collection[str], blobs: Path) -> dict[str, Query[Any]]:
     """Queries by id. Not the store's own, which keeps all that it was ever asked for."""
-    queries = _bodies(connection, ids)
-    found = _bodies(connection, {c for body in queries.values() for c in body["candidates"]})
+    queries = bodies(connection, ids)
+    found = bodies(connection, {c for body in queries.values() for c in body["candidates"]})
     candidates = {id: load_candidate(id, body, blobs) for id, body in found.items()}
     return {id: Query(tuple(candidates[c] for c in body["candidates"])) for id, body in queries.items()}
-
-
-def _bodies(connection: sql.Connection, ids: Collection[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for some in chunks(ids, CHUNK):
-        chosen = sql.select(event.c.id, event.c.body).where(
-            event.c.id.in_(some), event.c.kind.in_(("query", "candidate"))
-        )
-        found |= {one.id: one.body for one in connection.execute(chosen)}
-    return found
 
 
 def refuse_segments(given: Given, form: str) -> None:
