@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from prefrl.stats.intervals import wilson
+from prefrl.stats.estimates import wilson
 from prefrl.types import Floats
 
 

@@ -6,7 +6,6 @@ that are alike is drawing how often each pattern comes up: that keeps large tabl
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from scipy import stats
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from prefrl.stats.estimates import Estimate, undefined
+from prefrl.stats.estimates import Estimate, undefined, wilson
 from prefrl.types import Floats, Integers
 
 RESAMPLES = 999
@@ -25,16 +24,6 @@ FEW = 5
 """With fewer units than this a bootstrap says nothing."""
 CHUNK = 4_000_000
 """Numbers that are drawn at once."""
-
-
-def wilson(share: float, count: int) -> tuple[float, float]:
-    """The 95 % interval of a proportion (Wilson 1927), ties as halves; honest for small counts, within 0 and 1."""
-    z = float(stats.norm.ppf(0.975))
-    centre = share + z * z / (2 * count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    scale = 1 + z * z / count
-    # Rounding must not put the share itself outside, where it is 0 or 1.
-    return min(max((centre - half) / scale, 0.0), share), max(min((centre + half) / scale, 1.0), share)
 
 
 def share(hits: int, count: int, nothing: str = "nothing to count") -> Estimate:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from prefrl.evaluate.calibration import reliability
-from prefrl.stats.intervals import wilson
+from prefrl.stats.estimates import wilson
 
 
 def test_bins_by_hand() -> None:

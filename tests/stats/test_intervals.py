@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from prefrl.stats.intervals import clusters, correlate, correlation, mean, wilson
+from prefrl.stats.estimates import wilson
+from prefrl.stats.intervals import clusters, correlate, correlation, mean
 
 
 def test_comparisons_that_share_a_candidate_hang_together() -> None:
