@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeAlias
+from typing import Generic, Literal, TypeAlias
 
-import numpy as np
-
-from prefrl.types import C, Query
+from prefrl.types import C, Query, is_whole
 
 
 @dataclass(frozen=True)
@@ -136,11 +134,6 @@ def check_fits(answer: Answer, size: int) -> None:
             fits = True
     if not fits:
         raise ValueError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
-
-
-def is_whole(value: Any, most: float = math.inf) -> bool:
-    """Whether a value is a whole number from 0 on, true and false not among them."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) <= most
 
 
 def check_weight(weight: float) -> None:

@@ -19,12 +19,12 @@ import sqlalchemy as sql
 from prefrl.judgements import Answer, Judged, Skip, check_fits
 from prefrl.storage.arrivals import Merged, check_arrivals
 from prefrl.storage.blobs import read_arrays, write_arrays
-from prefrl.storage.events import ANSWER_TYPES, describe, load_candidate, read_answer
+from prefrl.storage.events import ANSWER_TYPES, describe, load_candidate, read_answer, write_candidate
 from prefrl.storage.log import EventLog, StoreError, Transaction, row
 from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
-from prefrl.types import C, Candidate, Floats, Query, Segment
+from prefrl.types import C, Candidate, Floats, Query
 
 WRITERS = 16
 """Files written at once."""
@@ -134,7 +134,7 @@ class Store(Generic[C]):
         self._file_one(load_candidate(one["id"], one["body"], blobs))
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
-        """A store holds segments or responses, not both: a learner could make nothing of the others."""
+        """A store holds candidates of one kind: a learner could make nothing of the others."""
         with self.log.reading() as connection:
             there = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
         new = next(iter(candidates), None)
@@ -149,9 +149,7 @@ class Store(Generic[C]):
             list(pool.map(self._file_one, candidates))  # waits, and raises what a thread raised
 
     def _file_one(self, candidate: Candidate) -> None:
-        if isinstance(candidate, Segment):
-            arrays = {"observations": candidate.observations, "actions": candidate.actions, "states": candidate.states}
-            write_arrays(self.folder / "blobs", candidate.id, {k: v for k, v in arrays.items() if v is not None})
+        write_candidate(candidate, self.folder / "blobs")
         if candidate.gold is not None:
             write_arrays(self.folder / "gold", candidate.id, {"gold": candidate.gold})
 

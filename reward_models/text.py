@@ -13,8 +13,8 @@ from pydantic import Field, model_validator
 from torch import Tensor
 from torch.nn.functional import linear
 
-from prefrl.components import ConfigError, Settings
-from prefrl.protocols import Task, TextTask
+from prefrl.components import Settings
+from prefrl.protocols import Task, text
 from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.seeding import draw_seed
@@ -22,6 +22,7 @@ from prefrl.types import Floats, Response, State
 
 CHUNK = 128
 """Responses scored at once outside a fit: bounds the memory, and lets rows of like length share a pass."""
+NEEDS = "reward kind 'transformer' scores text responses"
 
 
 class TransformerSettings(Settings):
@@ -63,14 +64,14 @@ class TransformerSettings(Settings):
         if self.checkpoint:
             from prefrl.reward_models.io import load_classifier
 
-            backbone, head = load_classifier(self.checkpoint, _text(task), self.download, self.chat_template)
+            backbone, head = load_classifier(self.checkpoint, text(task, NEEDS), self.download, self.chat_template)
             reward = TransformerReward(self, backbone, rng)
             reward.start_from(head)
             return reward
         if self.backbone:
-            backbone = of_folder(self.backbone, _text(task), self.download, self.pool, bool(self.chat_template))
+            backbone = of_folder(self.backbone, text(task, NEEDS), self.download, self.pool, bool(self.chat_template))
         else:
-            backbone = of_policy(_text(task), bool(self.chat_template))
+            backbone = of_policy(text(task, NEEDS), bool(self.chat_template))
         return TransformerReward(self, backbone, rng)
 
 
@@ -217,9 +218,3 @@ def _padded(rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
     width = max(map(len, rows))
     tokens = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows])
     return {"tokens": tokens, "lengths": torch.tensor([len(row) for row in rows])}
-
-
-def _text(task: Task) -> TextTask:
-    if task.kind != "text":
-        raise ConfigError(f"reward kind 'transformer' scores text responses, but the task is of kind {task.kind!r}")
-    return task  # type: ignore[return-value]

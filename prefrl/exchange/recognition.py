@@ -15,8 +15,9 @@ import sqlalchemy as sql
 from prefrl.exchange.exports.given import stored_queries
 from prefrl.exchange.layout import Row
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.kinds import kind_of
 from prefrl.storage.tables import query as asked
-from prefrl.types import Candidate, Query, Response, Segment
+from prefrl.types import Candidate, Query
 
 QUERY = re.compile("[0-9a-f]{64}")
 
@@ -44,9 +45,8 @@ def _placed(row: Row, query: Query[Any]) -> Row:
 
 def _bare(candidate: Candidate) -> str:
     """The id that a candidate has where a file has lost what it could not hold."""
-    if isinstance(candidate, Segment):
-        return replace(candidate, states=None, gold=None).id
-    return Response(candidate.prompt, candidate.text).id
+    plain: Candidate = kind_of(candidate).plain(candidate)
+    return plain.id
 
 
 def _turned(answer: Answer, places: Sequence[int]) -> Answer:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
 from prefrl.policies.generate import Sampling, generate
-from prefrl.protocols import Task, TextTask
+from prefrl.protocols import TextTask
 from prefrl.seeding import draw_seed
 from prefrl.types import Response, State
 
@@ -193,10 +192,3 @@ def check_head(model: PreTrainedModel) -> None:
     ours = head_logits(model, model.base_model(input_ids=ids, use_cache=False).last_hidden_state)
     if not torch.allclose(direct, ours, atol=1e-4, rtol=1e-4):
         raise ConfigError(f"{type(model).__name__} does more to its logits than its head says; this is not supported")
-
-
-def text(task: Task, kind: str) -> TextTask:
-    """A task, known to be of text. Raises `ConfigError` for others."""
-    if task.kind != "text":
-        raise ConfigError(f"learner kind {kind!r} writes text, but the task is of kind {task.kind!r}")
-    return cast(TextTask, task)

@@ -16,6 +16,7 @@ from typing import IO, Any, NamedTuple
 import sqlalchemy as sql
 
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.kinds import kind_of, only
 from prefrl.storage.events import load_candidate, read_answer
 from prefrl.storage.files import make_folder, sync_folder
 from prefrl.storage.log import StoreError
@@ -136,8 +137,8 @@ def _bodies(connection: sql.Connection, ids: Collection[str]) -> dict[str, Any]:
 
 def refuse_segments(given: Given, form: str) -> None:
     """Raise `StoreError` where a form for texts would have to hold segments."""
-    if not isinstance(given.query.candidates[0], Response):
-        raise StoreError(f"judgements of control segments do not fit the form {form!r}; use --form bundle or minari")
+    error = StoreError(f"judgements of control segments do not fit the form {form!r}; use --form bundle or minari")
+    only(Response, given.query.candidates, error)
 
 
 @dataclass
@@ -160,7 +161,7 @@ class Tally:
             WEIGHT: weight != 1.0,
             STRENGTH: soft,
             ABOUT: bool(given.about),
-            TOKENS: any(isinstance(c, Response) and c.tokens for c in given.query.candidates),
+            TOKENS: any(kind_of(c).tokens(c) for c in given.query.candidates),
             WHOLE: not isinstance(answer, Comparison | Skip),
         }
         self.dropped.update(name for name, there in has.items() if there and name not in self.holds)
