@@ -29,7 +29,7 @@ class Row(NamedTuple):
     @property
     def judged(self) -> Judged[Any]:
         """The judgement; for rows that are no skip."""
-        if isinstance(self.answer, Skip):
+        if self.answer.reason is not None:
             raise ValueError("a skip is no judgement")
         return Judged(self.query, self.answer)
 

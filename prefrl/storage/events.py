@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,16 @@ def load_candidate(id: str, body: dict[str, Any], blobs: Path) -> Any:
     return loaded
 
 
+def answer_kind(answer: Answer) -> str:
+    """The kind of the event that holds an answer."""
+    return next(kind for kind, cls in ANSWER_TYPES.items() if isinstance(answer, cls))
+
+
+def answer_body(answer: Answer) -> dict[str, Any]:
+    """What the event that holds an answer says beside its query and its labeler."""
+    return {name: value for name, value in asdict(answer).items() if name not in ("query", "labeler")}
+
+
 def read_answer(kind: str, query: str, labeler: str, body: dict[str, Any]) -> Answer:
     """The answer that an event holds; JSON has lists where answers have tuples."""
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in body.items() if k != "about"}
@@ -73,7 +84,7 @@ def check_answer(answer: Answer, size: int) -> None:
     check_text("labeler", answer.labeler)
     if answer.shown and not _is_order(answer.shown, size):
         raise ValueError(f"shown: expected each of 0 to {size - 1} once, got {answer.shown!r:.200}")
-    if not isinstance(answer, Skip) and not _is_finite(answer.weight):
+    if answer.reason is None and not _is_finite(answer.weight):
         raise ValueError(f"weight: expected a finite number, got {answer.weight!r:.40}")
     match answer:
         case Comparison(preference=preference):
