@@ -243,7 +243,7 @@ def columns(answer: Answer) -> dict[str, Any]:
 
 
 def is_soft(answer: Answer) -> bool:
-    """Whether it says how strong a preference is."""
+    """Whether it says how strong a preference is: one that is neither a tie nor a certainty."""
     return isinstance(answer, Comparison) and answer.preference not in (0.0, 0.5, 1.0)
 
 

@@ -46,8 +46,6 @@ OF_EVENTS = {
 }
 """Events that are no answers, as they are called in a tally."""
 CHECK = "check question"
-CERTAIN = (0.0, 0.5, 1.0)
-"""Preferences that say nothing of how strong they are."""
 
 
 class Given(NamedTuple):
@@ -104,8 +102,8 @@ def _answers_to(connection: sql.Connection, ids: Collection[str]) -> Iterator[sq
 def knows_strengths(store: Store[Any]) -> bool:
     """Whether any preference is neither a tie nor a certainty."""
     with store.log.reading() as connection:
-        comparisons = (e for some in _standing(connection) for e in some if e["kind"] == "comparison")
-        return any(e["body"]["preference"] not in CERTAIN for e in comparisons)
+        found = (e for some in _standing(connection) for e in some)
+        return any(is_soft(read_answer(e["kind"], e["subject"], e["actor"], e["body"])) for e in found)
 
 
 def _standing(connection: sql.Connection) -> Iterator[list[dict[str, Any]]]:
