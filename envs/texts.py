@@ -22,6 +22,7 @@ from transformers import (
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.text import for_evaluation
 from prefrl.exchange.formats import read_judgements
+from prefrl.kinds import only
 from prefrl.policies.cloning import make_tokenizer
 from prefrl.policies.pretrained import load_tokenizer, load_weights
 from prefrl.types import Floats, Response
@@ -58,9 +59,9 @@ class TextsSettings(Settings):
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
         model, tokenizer = _load(self.model) if self.model else _small(self)
         judged = read_judgements(self.prompts).judged if self.prompts else ()
-        if judged and not isinstance(judged[0].query.candidates[0], Response):
-            raise ConfigError(f"task.prompts: {self.prompts} holds segments; expected responses to prompts")
-        return Texts(self.response_tokens, tokenizer, model, tuple({j.query.candidates[0].context: 0 for j in judged}))
+        refusal = ConfigError(f"task.prompts: {self.prompts} holds segments; expected responses to prompts")
+        first = only(Response, [one.query.candidates[0] for one in judged], refusal)
+        return Texts(self.response_tokens, tokenizer, model, tuple({one.prompt: 0 for one in first}))
 
 
 @dataclass(frozen=True, eq=False)

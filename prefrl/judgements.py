@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, ClassVar, Generic, Literal, TypeAlias
 
-import numpy as np
-
-from prefrl.types import C, Query
+from prefrl.types import C, Query, is_whole
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class Comparison:
     """The order in which the candidates were shown; the preference itself is in the query's own order."""
     weight: float = 1.0
     """How much the judgement counts in a fit."""
+    reason: ClassVar[None] = None
+    """There is a judgement, so no reason why there is none; see `Skip`."""
 
     def __post_init__(self) -> None:
         check_weight(self.weight)
@@ -40,6 +42,7 @@ class Ranking:
     labeler: str = ""
     shown: tuple[int, ...] = ()
     weight: float = 1.0
+    reason: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         check_weight(self.weight)
@@ -57,6 +60,7 @@ class Choice:
     labeler: str = ""
     shown: tuple[int, ...] = ()
     weight: float = 1.0
+    reason: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         check_weight(self.weight)
@@ -76,6 +80,7 @@ class Rating:
     labeler: str = ""
     shown: tuple[int, ...] = ()
     weight: float = 1.0
+    reason: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         check_weight(self.weight)
@@ -138,9 +143,116 @@ def check_fits(answer: Answer, size: int) -> None:
         raise ValueError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
 
 
-def is_whole(value: Any, most: float = math.inf) -> bool:
-    """Whether a value is a whole number from 0 on, true and false not among them."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) <= most
+# --- what an answer says ----------------------------------------------------------------------------------------------
+
+Pair: TypeAlias = tuple[int, int, float]
+"""(i, j, preference that i is better)."""
+
+
+def implied_pairs(judgement: Judgement, size: int) -> list[Pair]:
+    """One for each pair of `size` candidates that the judgement speaks of."""
+    match judgement:
+        case Comparison(preference=preference):
+            return [(0, 1, preference)]
+        case Choice(best=best):
+            return [(best, j, 1.0) for j in range(size) if j != best]
+        case Ranking(ranks=ranks):
+            worth = [-rank for rank in ranks]
+        case Rating(levels=levels):
+            worth = list(levels)
+    signs = ((i, j, (worth[i] > worth[j]) - (worth[i] < worth[j])) for i, j in combinations(range(size), 2))
+    return [(i, j, 0.5 + 0.5 * sign) for i, j, sign in signs]
+
+
+def best_of(answer: Answer) -> int | None:
+    """The one candidate that an answer puts above every other; None where there is none."""
+    match answer:
+        case Comparison(preference=preference):
+            worth = [int(preference > 0.5) - int(preference < 0.5), 0]
+        case Ranking(ranks=ranks):
+            worth = [-rank for rank in ranks]
+        case Rating(levels=levels):
+            worth = list(levels)
+        case Choice(best=best):
+            return best
+        case Skip():
+            return None
+    return worth.index(max(worth)) if worth.count(max(worth)) == 1 else None
+
+
+def good(judgement: Judgement, size: int) -> list[bool | None]:
+    """For each candidate whether it is good; None where that is not said.
+
+    A rating is good in the upper half of its scale. In what compares, a candidate is good that is better than another
+    and worse than none, and bad the other way round.
+    """
+    if isinstance(judgement, Rating):
+        middle = (judgement.scale - 1) / 2
+        return [None if level == middle else level > middle for level in judgement.levels]
+    better, worse = set[int](), set[int]()
+    for i, j, preference in implied_pairs(judgement, size):
+        if preference != 0.5:
+            better.add(i if preference > 0.5 else j)
+            worse.add(j if preference > 0.5 else i)
+    return [None if (k in better) == (k in worse) else k in better for k in range(size)]
+
+
+def moved(answer: Answer, places: Sequence[int]) -> Answer:
+    """The answer where candidate i of its query stands in place `places[i]`."""
+    answer = replace(answer, shown=tuple(places[i] for i in answer.shown))
+    match answer:
+        case Comparison(preference=preference):
+            return replace(answer, preference=preference if places[0] == 0 else 1.0 - preference)
+        case Ranking(ranks=ranks):
+            return replace(answer, ranks=_in_places(ranks, places))
+        case Rating(levels=levels):
+            return replace(answer, levels=_in_places(levels, places))
+        case Choice(best=best):
+            return replace(answer, best=places[best])
+        case Skip():
+            return answer
+
+
+def _in_places(values: Sequence[int], places: Sequence[int]) -> tuple[int, ...]:
+    by_place = dict(zip(places, values, strict=True))
+    return tuple(by_place[place] for place in range(len(values)))
+
+
+def same(one: Answer, other: Answer) -> bool:
+    """Whether two answers say the same of the same query, preferences but for rounding."""
+    if isinstance(one, Comparison) and isinstance(other, Comparison):
+        # A file that counts from the other side holds 1 - p, which has been rounded.
+        close = abs(one.preference - other.preference) < 1e-9
+        return close and replace(one, preference=other.preference) == other
+    return one == other
+
+
+def columns(answer: Answer) -> dict[str, Any]:
+    """The answer as the columns of a row that lists its candidates in the query's order."""
+    match answer:
+        case Comparison(preference=preference):
+            return {"preference": preference}
+        case Ranking(ranks=ranks):
+            return {"ranks": list(ranks)}
+        case Choice(best=best):
+            return {"best": best}
+        case Rating(levels=levels, scale=scale):
+            return {"ratings": list(levels), "scale": scale}
+        case Skip(reason=reason):
+            return {"skip": reason}
+
+
+def is_soft(answer: Answer) -> bool:
+    """Whether it says how strong a preference is: one that is neither a tie nor a certainty."""
+    return isinstance(answer, Comparison) and answer.preference not in (0.0, 0.5, 1.0)
+
+
+def is_pairwise(answer: Answer) -> bool:
+    """Whether nothing is lost when its pairs are written in its place."""
+    return isinstance(answer, Comparison | Skip)
+
+
+# --- checked ----------------------------------------------------------------------------------------------------------
 
 
 def check_weight(weight: float) -> None:

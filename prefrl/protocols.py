@@ -6,11 +6,13 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
+from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Judged
+from prefrl.kinds import RESPONSES, SEGMENTS
 from prefrl.seeding import Device
 from prefrl.types import Bools, C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
 
@@ -28,7 +30,18 @@ class Task(Protocol):
 
     @property
     def kind(self) -> str:
-        """ "control" or "text"."""
+        """The name of the kind of its candidates, see `prefrl.kinds`."""
+
+
+class DrawnTask(Task, Protocol[C_contra]):
+    """A task whose candidates are shown as clips."""
+
+    @property
+    def fps(self) -> float:
+        """Pictures of a clip per second."""
+
+    def frames(self, candidate: C_contra, /) -> np.ndarray:
+        """(T, H, W, 3) uint8 pictures of a candidate."""
 
 
 class Transition(NamedTuple):
@@ -148,6 +161,20 @@ class TextTask(Task, Protocol):
 
     def fluency(self, responses: Sequence[Response]) -> Floats | None:
         """(N,) 1 where a response is well formed, else 0; None where the task cannot tell."""
+
+
+def control(task: Task, what: str) -> ControlTask:
+    """A task, known to be of control. Raises `ConfigError` for others; `what` says who needs it and for what."""
+    if task.kind != SEGMENTS.name:
+        raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
+    return cast(ControlTask, task)
+
+
+def text(task: Task, what: str) -> TextTask:
+    """A task, known to be of text, as `control` is for its own."""
+    if task.kind != RESPONSES.name:
+        raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
+    return cast(TextTask, task)
 
 
 class Labeler(Protocol[C]):

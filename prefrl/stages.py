@@ -21,7 +21,8 @@ from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
-from prefrl.protocols import Attended, Labeler
+from prefrl.kinds import only
+from prefrl.protocols import Attended, Labeler, text
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
@@ -98,8 +99,7 @@ def attended(labeler: Labeler[Any], store: Store[Any], tell: Tell) -> Iterator[N
 
 def read_queries(path: Path, task: Any) -> list[Query[Response]]:
     """Queries from JSON lines `{"prompt": ..., "responses": [...]}`. Raises `ValueError` with the row's number."""
-    if task.kind != "text":
-        raise ValueError(f"{path} holds responses to prompts, but {task.name} is no text task")
+    text(task, f"{path} holds responses to prompts")
     queries = []
     for number, line in enumerate(read_lines(path), 1):
         try:
@@ -237,12 +237,12 @@ def _write_rewardbench(subject: Subject, folder: Path) -> None:
     from prefrl.reward_models.text import TransformerReward
 
     pairs, rows = batch(subject.judged), []
-    if not all(isinstance(c, Response) for c in pairs.candidates):
-        raise RunError("RewardBench knows pairs of texts: segments of control cannot be written for it")
+    refusal = RunError("RewardBench knows pairs of texts: segments of control cannot be written for it")
+    responses = only(Response, pairs.candidates, refusal)
     scores = subject.reward.score(pairs.candidates)
     for number, ((first, second), preference) in enumerate(zip(pairs.edges, pairs.preference, strict=True)):
         best, worst = (first, second) if preference > 0.5 else (second, first)
-        chosen, rejected = (pairs.candidates[i].prompt + pairs.candidates[i].text for i in (best, worst))
+        chosen, rejected = (responses[i].prompt + responses[i].text for i in (best, worst))
         if preference != 0.5:
             rows.append(ScoredPair(number, subject.data, chosen, rejected, float(scores[best]), float(scores[worst])))
     reward = subject.reward  # a reward model of another make knows no chat template

@@ -7,9 +7,10 @@ batch, M comparisons, E ensemble members, B sequences, L tokens, V vocabulary.
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,28 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 Metrics: TypeAlias = dict[str, float]
 State: TypeAlias = dict[str, Any]
 """Nested dicts and lists of arrays, tensors, numbers, strings and None: what a checkpoint can hold."""
+LARGEST = 2**31 - 1
+"""The largest whole number in what comes from elsewhere: every database and every table holds it."""
+
+
+class Candidate(Protocol):
+    """One behaviour that can be judged. Each kind of them has a row in `prefrl.kinds`."""
+
+    @property
+    def id(self) -> str:
+        """sha256 of its content, the gold left out."""
+
+    @property
+    def context(self) -> str:
+        """Only candidates of one context may be compared."""
+
+    @property
+    def gold(self) -> Floats | None:
+        """(T,) the task's own values, one for each step, or (1,) for the whole. Hidden from all that learns."""
+
+
+C = TypeVar("C", bound=Candidate)
+C_contra = TypeVar("C_contra", bound=Candidate, contravariant=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +79,7 @@ class Segment:
     def id(self) -> str:
         """sha256 over names, dtypes, shapes and bytes (C order). The gold is not part of it."""
         arrays = {"observations": self.observations, "actions": self.actions, "states": self.states}
-        return _digest(f"{self.episode}/{self.start}", {k: v for k, v in arrays.items() if v is not None})
+        return digest(f"{self.episode}/{self.start}", {k: v for k, v in arrays.items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +104,7 @@ class Response:
     def id(self) -> str:
         """sha256 over prompt, text and tokens. The gold is not part of it."""
         tokens = {"prompt_tokens": np.array(self.prompt_tokens, np.int64), "tokens": np.array(self.tokens, np.int64)}
-        return _digest(f"{self.prompt}\0{self.text}", tokens)
-
-
-Candidate: TypeAlias = Segment | Response
-C = TypeVar("C", Segment, Response)
-C_contra = TypeVar("C_contra", Segment, Response, contravariant=True)
+        return digest(f"{self.prompt}\0{self.text}", tokens)
 
 
 def gold_score(candidate: Candidate) -> float:
@@ -165,9 +183,15 @@ class Round(Generic[C]):
     """What did not go as asked, for people."""
 
 
-def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
-    digest = hashlib.sha256(header.encode("utf-8", "surrogatepass"))
+def is_whole(value: Any, most: float = math.inf) -> bool:
+    """Whether a value is a whole number from 0 on, true and false not among them."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) <= most
+
+
+def digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
+    """The id of a candidate, from its text and its named arrays: sha256 over names, dtypes, shapes and bytes."""
+    found = hashlib.sha256(header.encode("utf-8", "surrogatepass"))
     for name, array in arrays.items():
-        digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+        found.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()

@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from prefrl.components import ConfigError, Settings
-from prefrl.protocols import ControlTask, Task
+from prefrl.protocols import ControlTask, Task, control
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
-from prefrl.reward_models.steps import CACHED, StepReward, control, each_input, uniform
+from prefrl.reward_models.steps import CACHED, StepReward, each_input, uniform
 from prefrl.seeding import generator
 
 
@@ -42,7 +42,7 @@ class CNNSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         _check(self.image, found)
         network = CNN(self, found.action_size, generator(rng))
         return StepReward(network, found, self.gain, self.combine, self.measure)

@@ -12,9 +12,9 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from prefrl.components import ConfigError, Settings, feature_functions, suggest
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import CACHED, Describe, StepReward, control, input_width
+from prefrl.reward_models.steps import CACHED, Describe, StepReward, input_width
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats
 
@@ -42,7 +42,7 @@ class LinearSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
-        found, describe = control(task, self.kind), self._hand_made()
+        found, describe = control(task, f"reward kind {self.kind!r} scores control segments"), self._hand_made()
         network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 

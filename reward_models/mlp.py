@@ -12,10 +12,10 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.components import Settings
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.perceptron import Activation, perceptrons
-from prefrl.reward_models.steps import StepReward, control, uniform
+from prefrl.reward_models.steps import StepReward, uniform
 from prefrl.seeding import generator
 
 
@@ -35,7 +35,7 @@ class MLPSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         sizes = (found.observation_size + found.action_size, *self.hidden, 1)
         return StepReward(MLP(self.members, sizes, self.activation, generator(rng)), found, self.gain, self.combine)
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.functional import gelu, layer_norm, scaled_dot_product_attention
 
 from prefrl.components import ConfigError, Settings
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import CACHED, StepReward, control, uniform
+from prefrl.reward_models.steps import CACHED, StepReward, uniform
 from prefrl.seeding import generator
 
 
@@ -34,7 +34,7 @@ class GRUSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         network = GRU(self, found.observation_size + found.action_size, self.memory or found.segment_steps, rng)
         return StepReward(network, found, self.gain, self.combine)
 
@@ -108,7 +108,7 @@ class PreferenceTransformerSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         if self.width % self.heads:
             raise ConfigError(f"reward.width must be a multiple of reward.heads, got {self.width} and {self.heads}")
         inputs = found.observation_size + found.action_size

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from prefrl.components import ConfigError
-from prefrl.protocols import ControlTask, Task
+from prefrl.protocols import ControlTask
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Segment, State
@@ -335,13 +335,6 @@ def each_input(steps: Tensor) -> tuple[Tensor, Tensor]:
     variance = sum((each[:, : len(piece)] @ piece)[0] for piece in squares)
     std = torch.as_tensor(variance).sqrt()
     return mean, torch.where(std > 1e-6, std, 1.0)
-
-
-def control(task: Task, kind: str) -> ControlTask:
-    """A task, known to be of control. Raises `ConfigError` for others."""
-    if task.kind != "control":
-        raise ConfigError(f"reward kind {kind!r} scores control segments, but the task is of kind {task.kind!r}")
-    return task  # type: ignore[return-value]
 
 
 def _flat(inputs: Tensor, mask: Tensor) -> tuple[Tensor, np.ndarray]:

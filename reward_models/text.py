@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 from torch import Tensor
 from torch.nn.functional import linear
 
-from prefrl.components import ConfigError, Settings
+from prefrl.components import Settings
 from prefrl.policies.language import pad_right
-from prefrl.protocols import Task, TextTask
+from prefrl.protocols import Task, text
 from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
 from prefrl.reward_models.ensemble import Ensemble, combine
 from prefrl.seeding import generator, to_numpy
@@ -23,6 +23,7 @@ from prefrl.types import Floats, Response, State
 
 CHUNK = 128
 """Responses scored at once outside a fit: bounds the memory, and lets rows of like length share a pass."""
+NEEDS = "reward kind 'transformer' scores text responses"
 
 
 class TransformerSettings(Settings):
@@ -64,14 +65,14 @@ class TransformerSettings(Settings):
         if self.checkpoint:
             from prefrl.reward_models.io import load_classifier
 
-            backbone, head = load_classifier(self.checkpoint, _text(task), self.download, self.chat_template)
+            backbone, head = load_classifier(self.checkpoint, text(task, NEEDS), self.download, self.chat_template)
             reward = TransformerReward(self, backbone, rng)
             reward.start_from(head)
             return reward
         if self.backbone:
-            backbone = of_folder(self.backbone, _text(task), self.download, self.pool, bool(self.chat_template))
+            backbone = of_folder(self.backbone, text(task, NEEDS), self.download, self.pool, bool(self.chat_template))
         else:
-            backbone = of_policy(_text(task), bool(self.chat_template))
+            backbone = of_policy(text(task, NEEDS), bool(self.chat_template))
         return TransformerReward(self, backbone, rng)
 
 
@@ -221,9 +222,3 @@ class TransformerReward:
         """Right-padded with 0, which is a valid id; lengths say what is real."""
         tokens, lengths = pad_right(rows, self._heads.device)
         return {"tokens": tokens, "lengths": lengths}
-
-
-def _text(task: Task) -> TextTask:
-    if task.kind != "text":
-        raise ConfigError(f"reward kind 'transformer' scores text responses, but the task is of kind {task.kind!r}")
-    return task  # type: ignore[return-value]

@@ -75,6 +75,7 @@ class LinearReward:
     def _one(self, candidate: Candidate, weights: Floats) -> float:
         if isinstance(candidate, Response):
             return float(weights[0] * (len(candidate.tokens) or len(candidate.text)))
+        assert isinstance(candidate, Segment)
         return float((candidate.observations.astype(np.float64) @ weights).sum())
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, check_fits
+from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, check_fits, implied_pairs
 from prefrl.types import Query, Response
 
 
@@ -62,3 +62,14 @@ def test_an_answer_fits_queries_of_its_own_size_only(answer: Answer, sizes: set[
 def test_judgements_that_say_nothing_are_refused(make: Callable[[], Answer]) -> None:
     with pytest.raises(ValueError, match="got"):
         make()
+
+
+def test_a_ranking_implies_all_pairs_ties_included() -> None:
+    assert implied_pairs(Ranking("q", (0, 1, 1)), 3) == [(0, 1, 1.0), (0, 2, 1.0), (1, 2, 0.5)]
+    assert implied_pairs(Comparison("q", 0.7), 2) == [(0, 1, 0.7)]
+
+
+def test_the_best_of_a_few_beats_each_other_and_a_rating_compares_levels() -> None:
+    assert implied_pairs(Choice("q", 1), 3) == [(1, 0, 1.0), (1, 2, 1.0)]
+    assert implied_pairs(Rating("q", (2, 0, 2), 3), 3) == [(0, 1, 1.0), (0, 2, 0.5), (1, 2, 0.0)]
+    assert implied_pairs(Rating("q", (2,), 3), 1) == []

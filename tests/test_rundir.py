@@ -228,7 +228,7 @@ def test_a_kept_reward_that_was_changed_is_refused(tmp_path: Path) -> None:
 def test_a_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
     finish(tiny("control/toy", "loop.rounds=1"), tmp_path / name)
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    with Store(tmp_path / name, write=False) as store:
+    with Store[Any](tmp_path / name, write=False) as store:
         assert store.counts()["answered"] == 24
 
 

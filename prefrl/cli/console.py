@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from prefrl.evaluate.card import ReportCard
+from prefrl.kinds import find, named
 from prefrl.loop import Loop
 from prefrl.report import card_words
 from prefrl.types import Round
@@ -35,7 +36,7 @@ class _Stage(ProgressColumn):
     def __init__(self, loop: Loop[Any]) -> None:
         super().__init__()
         self.loop = loop
-        self.unit = "tokens" if loop.task.kind == "text" else "steps"
+        self.unit = f"{named(loop.task.kind).step}s"
 
     def render(self, task: Row) -> Text:
         spent = sum(self.loop.learner.steps)
@@ -160,7 +161,7 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     gold = f"{number(summary['gold_before'])} → {number(summary['gold_after'])} (best {number(summary['gold_best'])})"
     table.add_row("gold", Text(gold, style="bold blue"))
     table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
-    if summary["kind"] == "text":
+    if (kind := find(summary["kind"])) and kind.drifts:
         table.add_row("kl to the start, nats", number(summary["kl"]))
         table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
     for name in ("labels", "steps"):

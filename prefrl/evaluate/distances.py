@@ -150,12 +150,12 @@ def _degree(width: int, rows: int) -> int:
 def distance_part(
     reward: RewardModel[Any],
     candidates: Sequence[Candidate],
-    known: Sequence[Segment],
+    known: Sequence[Candidate],
     discount: float,
     rng: np.random.Generator,
 ) -> Distance:
     """How far a learned reward is from the gold of the candidates' steps; `known` helps to guess gold in between."""
-    steps = [c for c in candidates if isinstance(c, Segment) and _has_gold(c)]
+    steps = _with_gold(candidates)
     if not isinstance(reward, StepRewardModel) or len(steps) < FEWEST:
         control = isinstance(candidates[0], Segment)
         none = undefined(f"fewer than {FEWEST} segments with gold" if control else "for control only")
@@ -164,7 +164,7 @@ def distance_part(
     learned = [reward.rewards(s.observations[None], s.actions[None])[0] for s in steps]
     direct, count = pearson_distance(np.concatenate(learned), np.concatenate(gold)), sum(map(len, gold))
     # By id, since a segment can be among both.
-    stand_in = regress(list({s.id: s for s in [*steps, *filter(_has_gold, known)]}.values()), rng)
+    stand_in = regress(list({s.id: s for s in [*steps, *_with_gold(known)]}.values()), rng)
     return Distance(
         epic=_epic_part(reward, stand_in, steps, discount, rng),
         direct=_constant() if direct is None else Estimate(value=direct, count=count),
@@ -196,6 +196,11 @@ def _epic_part(
 
 def _constant() -> Estimate:
     return undefined("a reward is the same at every step")
+
+
+def _with_gold(candidates: Sequence[Candidate]) -> list[Segment]:
+    """The segments whose gold is known at every step."""
+    return [c for c in candidates if isinstance(c, Segment) and _has_gold(c)]
 
 
 def _has_gold(segment: Segment) -> bool:

@@ -23,11 +23,12 @@ from prefrl.fit.pairs import compared
 from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.split import split
 from prefrl.judgements import Judged, person
+from prefrl.kinds import kind_of
 from prefrl.protocols import Judgements, RewardModel
 from prefrl.stats.estimates import Estimate, undefined
 from prefrl.stats.intervals import clusters, correlation
 from prefrl.storage.files import DamagedError
-from prefrl.types import Candidate, Floats, Integers, Query, Response, Segment, gold_score
+from prefrl.types import Candidate, Floats, Integers, Query, gold_score
 
 DRAWN = 300
 """Candidates in a scatter plot."""
@@ -61,7 +62,7 @@ class Subject:
     reward: RewardModel[Any]
     judged: Sequence[Judged[Any]]
     """Candidates carry their gold, where there is one."""
-    known: Sequence[Segment] = ()
+    known: Sequence[Candidate] = ()
     """Other segments that carry gold, for the regression that stands in for it."""
     discount: float = 0.99
     """What a reward a step later counts for in learning: shaping by a potential is told apart by it."""
@@ -129,7 +130,7 @@ def of_run(
     return Subject(
         reward,
         judged,
-        known=_segments(judgements(store)),
+        known=_candidates(judgements(store)),
         discount=discount,
         model=folder.resolve().name,
         data=folder.resolve().name,
@@ -162,9 +163,8 @@ def _gold_of(candidate: Any, store: Judgements[Any]) -> Floats | None:
         raise
 
 
-def _segments(judged: Sequence[Judged[Any]]) -> list[Segment]:
-    found = {c.id: c for one in judged for c in one.query.candidates}
-    return [c for c in found.values() if isinstance(c, Segment)]
+def _candidates(judged: Sequence[Judged[Any]]) -> list[Candidate]:
+    return list({c.id: c for one in judged for c in one.query.candidates}.values())
 
 
 def habits(fitting: FittingSettings, rows: Sequence[Mapping[str, Any]]) -> Habits:
@@ -212,7 +212,7 @@ def _about(subject: Subject, pairs: Pairs, candidates: Sequence[Candidate]) -> A
         model=subject.model,
         data=subject.data,
         held_out=subject.held_out,
-        kind="text" if isinstance(candidates[0], Response) else "control",
+        kind=kind_of(candidates[0]).name,
         round=subject.round,
         members=subject.reward.members,
         judgements=len(subject.judged),

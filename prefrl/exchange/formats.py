@@ -15,7 +15,7 @@ from typing import Any
 
 from prefrl.exchange.layout import Layout, Parts, Row, Which
 from prefrl.exchange.reading import TABLES, list_files
-from prefrl.judgements import Judged, Skip, person
+from prefrl.judgements import Judged, person
 
 SHOWN_ERRORS = 20
 SHOWN_REPEATS = 5
@@ -40,7 +40,7 @@ def read_judgements(path: Path, which: Which | None = None, layout: Layout | Non
     "script" beside a human's are left out, and said to be, unless `which` asks for them.
     """
     checked = check_file(path, which, layout, keep=True)
-    return Read(tuple(row.judged for row in checked.rows() if not isinstance(row.answer, Skip)), checked.notes)
+    return Read(tuple(row.judged for row in checked.rows() if row.answer.reason is None), checked.notes)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, is_whole, person
+from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, person
 from prefrl.storage.events import check_answer
-from prefrl.types import Query, Response
+from prefrl.types import Query, Response, is_whole
 
 
 class Row(NamedTuple):
@@ -29,7 +29,7 @@ class Row(NamedTuple):
     @property
     def judged(self) -> Judged[Any]:
         """The judgement; for rows that are no skip."""
-        if isinstance(self.answer, Skip):
+        if self.answer.reason is not None:
             raise ValueError("a skip is no judgement")
         return Judged(self.query, self.answer)
 

@@ -21,13 +21,12 @@ from prefrl.exchange.layout import Layout, Row, Which
 from prefrl.exchange.recognition import recognised
 from prefrl.judgements import Answer
 from prefrl.storage.arrivals import Against, otherwise
-from prefrl.storage.blobs import write_arrays
-from prefrl.storage.events import describe, read_answer
+from prefrl.storage.events import describe, read_answer, write_candidate
 from prefrl.storage.log import StoreError, Transaction, row
 from prefrl.storage.projection import CHUNK, RETRACTED, chunks, words
 from prefrl.storage.tables import event
 from prefrl.store import Store
-from prefrl.types import Candidate, Segment
+from prefrl.types import Candidate
 
 
 @dataclass(frozen=True)
@@ -154,10 +153,8 @@ def _standing(connection: sql.Connection, answers: Mapping[tuple[str, str], Answ
 def _put(store: Store[Any], tx: Transaction, some: Sequence[Row]) -> None:
     """Write answers with their queries in a transaction; arrays first, since a file cannot be undone but be unused."""
     candidates: dict[str, Candidate] = {c.id: c for one in some for c in one.query.candidates}
-    for id, candidate in candidates.items():
-        if isinstance(candidate, Segment):
-            arrays = {"observations": candidate.observations, "actions": candidate.actions, "states": candidate.states}
-            write_arrays(store.folder / "blobs", id, {k: v for k, v in arrays.items() if v is not None})
+    for candidate in candidates.values():
+        write_candidate(candidate, store.folder / "blobs")
     tx.extend([row(id, "candidate", body=describe(candidate)) for id, candidate in candidates.items()])
     asked = {one.query.id: [c.id for c in one.query.candidates] for one in some}
     tx.extend([row(id, "query", body={"candidates": ids, "batch": tx.seq}) for id, ids in asked.items()])

@@ -14,9 +14,10 @@ import sqlalchemy as sql
 
 from prefrl.exchange.exports.given import stored_queries
 from prefrl.exchange.layout import Row
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.judgements import moved
+from prefrl.kinds import kind_of
 from prefrl.storage.tables import query as asked
-from prefrl.types import Candidate, Query, Response, Segment
+from prefrl.types import Candidate, Query
 
 QUERY = re.compile("[0-9a-f]{64}")
 
@@ -38,33 +39,11 @@ def _placed(row: Row, query: Query[Any]) -> Row:
     # Two candidates that differ only in what a file loses cannot be told apart, so the row is left as it is.
     if len(places) < len(query.candidates) or set(own) != set(places):
         return row
-    answer = _turned(row.answer, [places[id] for id in own])
+    answer = moved(row.answer, [places[id] for id in own])
     return row._replace(query=query, answer=replace(answer, query=query.id, labeler=row.there))
 
 
 def _bare(candidate: Candidate) -> str:
     """The id that a candidate has where a file has lost what it could not hold."""
-    if isinstance(candidate, Segment):
-        return replace(candidate, states=None, gold=None).id
-    return Response(candidate.prompt, candidate.text).id
-
-
-def _turned(answer: Answer, places: Sequence[int]) -> Answer:
-    """The answer where candidate i of its query stands in place `places[i]`."""
-    answer = replace(answer, shown=tuple(places[i] for i in answer.shown))
-    match answer:
-        case Comparison(preference=preference):
-            return replace(answer, preference=preference if places[0] == 0 else 1.0 - preference)
-        case Ranking(ranks=ranks):
-            return replace(answer, ranks=_moved(ranks, places))
-        case Rating(levels=levels):
-            return replace(answer, levels=_moved(levels, places))
-        case Choice(best=best):
-            return replace(answer, best=places[best])
-        case Skip():
-            return answer
-
-
-def _moved(values: Sequence[int], places: Sequence[int]) -> tuple[int, ...]:
-    by_place = dict(zip(places, values, strict=True))
-    return tuple(by_place[place] for place in range(len(values)))
+    plain: Candidate = kind_of(candidate).plain(candidate)
+    return plain.id

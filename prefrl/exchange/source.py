@@ -14,11 +14,12 @@ from prefrl.exchange.formats import read_judgements
 from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.judgements import Judged, person
+from prefrl.kinds import kind_of
 from prefrl.protocols import Judgements
 from prefrl.storage.files import DamagedError
 from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
-from prefrl.types import Floats, Query, Segment
+from prefrl.types import Floats, Query
 
 
 @dataclass(frozen=True)
@@ -95,18 +96,13 @@ def _events(store: Store[Any], which: Which) -> Iterator[dict[str, Any]]:
 
 
 def check_candidates(judged: Sequence[Judged[Any]], task: Any) -> None:
-    """Raise `ValueError` unless all candidates are of the task's kind, and segments of its sizes."""
+    """Raise `ValueError` unless all candidates are of the task's kind, and as its behaviours are."""
     for candidate in (c for one in judged for c in one.query.candidates):
-        control = isinstance(candidate, Segment)
-        if control != (task.kind == "control"):
+        kind = kind_of(candidate)
+        if kind.name != task.kind:
             raise ValueError(
-                f"the judgements are of {'segments' if control else 'responses'}, but {task.name} is a task of "
-                f"kind {task.kind!r}: choose another config"
+                f"the judgements are of {kind.noun}s, but {task.name} is a task of kind {task.kind!r}: choose another "
+                "config"
             )
-        if isinstance(candidate, Segment):
-            sizes = (candidate.observations.shape[1], candidate.actions.shape[1])
-            if sizes != (expected := (task.observation_size, task.action_size)):
-                raise ValueError(
-                    f"segment {candidate.id[:12]} has observations and actions of {sizes} numbers a step, but "
-                    f"{task.name} has {expected}: choose another config"
-                )
+        if misfit := kind.misfit(candidate, task):
+            raise ValueError(f"{kind.noun} {candidate.id[:12]} {misfit}: choose another config")

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Generic
 
 import numpy as np
 import numpy.typing as npt
 
-from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.judgements import Judged, Rating, implied_pairs, person
 from prefrl.types import C, Floats, Integers
 
 
@@ -97,13 +96,3 @@ def _rated(data: Batch[C], judged: Sequence[Judged[C]], sides: Sequence[bool]) -
         else:
             pile.append((at, one))
     return _of_rows(data.candidates, rows)
-
-
-def implied_pairs(judgement: Judgement, size: int) -> list[tuple[int, int, float]]:
-    """(i, j, preference that i is better), one for each pair of `size` candidates that the judgement speaks of."""
-    if isinstance(judgement, Comparison):
-        return [(0, 1, judgement.preference)]
-    if isinstance(judgement, Choice):
-        return [(judgement.best, j, 1.0) for j in range(size) if j != judgement.best]
-    worth = [-r for r in judgement.ranks] if isinstance(judgement, Ranking) else list(judgement.levels)
-    return [(i, j, 0.5 + 0.5 * float(np.sign(worth[i] - worth[j]))) for i, j in combinations(range(size), 2)]

@@ -9,8 +9,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from prefrl.fit.pairs import implied_pairs
-from prefrl.judgements import Judged, Rating
+from prefrl.judgements import Judged, Rating, implied_pairs
 from prefrl.types import C
 
 

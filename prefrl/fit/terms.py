@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.fit.pairs import implied_pairs
 from prefrl.fit.settings import Rankings, Ties
-from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, implied_pairs, person
 from prefrl.types import C
 
 MOST_TIED = 10

@@ -1,4 +1,4 @@
-"""Our own policy gradients for control, on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
+"""Our own policy gradients for on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
 
 Variant: PPO's clip with GAE (Schulman et al. 2016, 2017), advantages whitened over the rollout, a learning rate steered
 by the KL in place of early stopping, and extra epochs for the critic after each fit of the reward. Values are not
@@ -21,17 +21,8 @@ from prefrl.evaluate.policies import evaluation
 from prefrl.improve.gradient import Batch, Objective, adam, steer, update
 from prefrl.improve.objectives import gae, masked_whiten
 from prefrl.policies.mlp import Decisions, MLPPolicy
-from prefrl.policies.rollout import (
-    Act,
-    Rollout,
-    collect,
-    control,
-    joined,
-    learned_rewards,
-    step_rewards,
-    whole_episodes,
-)
-from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task
+from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
@@ -113,7 +104,7 @@ class ControlLearnerSettings(Settings):
         return float(self.steps_per_round)
 
     def build(self, task: Task, rng: np.random.Generator) -> ControlLearner:
-        return ControlLearner(self, control(task, self.kind), rng)
+        return ControlLearner(self, control(task, f"learner kind {self.kind!r} acts in control tasks"), rng)
 
     def objective(self) -> Objective:
         """What a gradient step minimises."""

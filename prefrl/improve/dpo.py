@@ -19,8 +19,8 @@ from prefrl.fit.pairs import Batch, batch
 from prefrl.improve.gradient import Parts, descend
 from prefrl.improve.objectives import dpo_loss
 from prefrl.improve.writer import Writer
-from prefrl.policies.language import Responses, text
-from prefrl.protocols import RewardModel, Store, Task, TextTask
+from prefrl.policies.language import Responses
+from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device
 from prefrl.types import Evaluation, Integers, Metrics, Response, State, Steps
 
@@ -58,7 +58,7 @@ class DPOSettings(Settings):
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
 
     def build(self, task: Task, rng: np.random.Generator) -> DPO:
-        return DPO(self, text(task, self.kind))
+        return DPO(self, text(task, f"learner kind {self.kind!r} writes text"))
 
     def formula(self) -> str:
         wrong = f" + {self.label_smoothing:g} log s(-h)" if self.label_smoothing else ""

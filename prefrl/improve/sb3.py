@@ -21,8 +21,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from prefrl.components import ConfigError, Settings
 from prefrl.evaluate.policies import evaluation
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
-from prefrl.policies.rollout import Rollout, control, step_rewards, whole_episodes
-from prefrl.protocols import ControlTask, RewardModel, Store, Task
+from prefrl.policies.rollout import Rollout, step_rewards, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
@@ -91,7 +91,7 @@ class SB3Settings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
-        found = control(task, self.kind)
+        found = control(task, f"learner kind {self.kind!r} acts in control tasks")
         if self.algorithm == "SAC" and found.action_bounds is None:
             raise ConfigError("learner.algorithm=SAC needs continuous actions; use PPO")
         return SB3(self, found, rng)

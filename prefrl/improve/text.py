@@ -20,8 +20,8 @@ from prefrl.components import Settings, filled_in
 from prefrl.improve.gradient import Batch, Objective, update
 from prefrl.improve.objectives import AdaptiveKL, Reduction, group_normalised, kl_k1, leave_one_out, step_rewards
 from prefrl.improve.writer import Writer
-from prefrl.policies.language import Responses, text
-from prefrl.protocols import RewardModel, Store, Task, TextTask
+from prefrl.policies.language import Responses
+from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device, generator
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
 
@@ -114,7 +114,7 @@ class TextLearnerSettings(Settings):
         return 1.0
 
     def build(self, task: Task, rng: np.random.Generator) -> TextLearner:
-        return TextLearner(self, text(task, self.kind))
+        return TextLearner(self, text(task, f"learner kind {self.kind!r} writes text"))
 
     def formula(self) -> str:
         """The objective, as text."""

@@ -12,9 +12,10 @@ from typing import Generic, NamedTuple
 
 import numpy as np
 
+from prefrl.kinds import kind_of
 from prefrl.protocols import Store
 from prefrl.storage.files import DamagedError
-from prefrl.types import C, Floats, Integers, Query, Segment
+from prefrl.types import C, Floats, Integers, Query
 
 MOST = 1000
 """Candidates whose gold is looked at; each is a file."""
@@ -115,8 +116,8 @@ def _groups(candidates: Sequence[C], size: int, rng: np.random.Generator) -> Int
         if len(members) >= size:
             # Sorted, so that the same group in another order is not found again.
             group = sorted(members[j] for j in rng.choice(len(members), size, replace=False))
-            episodes = [c.episode for c in (candidates[j] for j in group) if isinstance(c, Segment)]
-            if len(set(episodes)) == len(episodes):
+            origins = {kind_of(c).origin(c) for c in (candidates[j] for j in group)}
+            if len(origins) == size:
                 found[tuple(group)] = None
     return np.array(list(found), np.int64).reshape(-1, size)
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import Settings
-from prefrl.judgements import Answer, Skip
+from prefrl.judgements import Answer
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.label.teachers import Limits, survey
 from prefrl.protocols import Store, Task
@@ -73,7 +73,7 @@ class Crowd:
         answers: list[Answer] = []
         for i in keyed(base, query.id).permutation(len(self.annotators)):
             one = self.annotators[i]
-            if sum(not isinstance(a, Skip) for a in answers) == self.settings.overlap:
+            if sum(a.reason is None for a in answers) == self.settings.overlap:
                 break
             if one.name in able:
                 # A generator for each: who else answers does not change what is said.

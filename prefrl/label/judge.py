@@ -16,9 +16,10 @@ from transformers import AutoModelForCausalLM, GenerationConfig, PreTrainedToken
 
 from prefrl.components import ConfigError, Settings
 from prefrl.judgements import Answer, Comparison, Ranking, Skip
+from prefrl.kinds import kind_of, only
 from prefrl.label.prompts import Prompter, answer_tokens, verdict
 from prefrl.policies.pretrained import load_tokenizer, load_weights
-from prefrl.protocols import Store, Task, TextTask
+from prefrl.protocols import Store, Task, text
 from prefrl.types import C, Floats, Integers, Metrics, Query, Response
 
 TEMPLATE = """\
@@ -80,10 +81,8 @@ class JudgeSettings(Settings):
 
     def build(self, task: Task) -> Judge:
         """Raises `ConfigError` for a control task, and where the model is missing or cannot say the answers."""
-        if task.kind != "text":
-            raise ConfigError(f"labeler kind 'judge' reads text responses, but the task is of kind {task.kind!r}")
-        text: TextTask = task  # type: ignore[assignment]
-        model, tokenizer = _load(self) if self.model else (text.model(), text.tokenizer)
+        texts = text(task, "labeler kind 'judge' reads text responses")
+        model, tokenizer = _load(self) if self.model else (texts.model(), texts.tokenizer)
         return Judge(self, model, tokenizer)
 
 
@@ -247,10 +246,10 @@ def _ranks(preferences: Floats, size: int) -> tuple[int, ...]:
 
 
 def _text(query: Query[C], i: int) -> Response:
-    candidate = query.candidates[i]
-    if not isinstance(candidate, Response):
-        raise ConfigError("labeler kind 'judge' reads text responses, and the store holds control segments")
-    return candidate
+    candidate, kind = query.candidates[i], kind_of(query.candidates[i])
+    held = f"{kind.name} {kind.noun}s"
+    error = ConfigError(f"labeler kind 'judge' reads text responses, and the store holds {held}")
+    return only(Response, [candidate], error)[0]
 
 
 def _left_padded(rows: Sequence[list[int]]) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.kinds import named
 from prefrl.label import teachers
 from prefrl.label.teachers import Limits, Survey
 from prefrl.protocols import Store, Task
@@ -82,13 +83,16 @@ class OracleSettings(Settings):
         return self.judgement == "rating" or any(getattr(self, name) for name in RELATIVE)
 
     def build(self, task: Task) -> Oracle:
-        if task.kind == "text" and self.discount != 1:
+        kind = named(task.kind)
+        if not kind.stepwise and self.discount != 1:
             raise ConfigError(
-                f"labeler.discount: the gold of a text has one step, so expected 1, got {self.discount}; "
+                f"labeler.discount: the gold of a {kind.noun} has one step, so expected 1, got {self.discount}; "
                 "a myopic teacher needs a control task"
             )
-        if task.kind != "text" and self.length_bias:
-            raise ConfigError("labeler.length_bias: only texts differ in length; expected 0 for a control task")
+        if not kind.lengthy and self.length_bias:
+            raise ConfigError(
+                f"labeler.length_bias: only texts differ in length; expected 0 for a task of kind {task.kind!r}"
+            )
         return Oracle(self)
 
 

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit
 
+from prefrl.kinds import kind_of
 from prefrl.protocols import Store
-from prefrl.types import C, Floats, Integers, Query, Response
+from prefrl.types import C, Floats, Integers, Query
 
 LARGEST = 700.0
 """The largest logit that is worked with: its exponential is still finite."""
@@ -79,8 +80,8 @@ def discounted(gold: Sequence[Floats], discount: float) -> Floats:
 
 
 def lengths(query: Query[C]) -> Floats:
-    """(K,) characters of each response, 0 for segments."""
-    return np.array([len(c.text) if isinstance(c, Response) else 0 for c in query.candidates], float)
+    """(K,) characters of each candidate, 0 where there are none to see."""
+    return np.array([kind_of(c).words(c) for c in query.candidates], float)
 
 
 def blocks(values: Sequence[Floats]) -> list[Floats]:

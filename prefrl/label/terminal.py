@@ -15,10 +15,11 @@ from rich.text import Text
 
 from prefrl.components import Settings
 from prefrl.judgements import Answer, Comparison, Ranking, Skip
+from prefrl.kinds import kind_of
 from prefrl.page.clips.encode import write_clip
-from prefrl.protocols import ControlTask, Store, Task
+from prefrl.protocols import DrawnTask, Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import C, Query, Response, Segment
+from prefrl.types import C, Query
 
 
 class Stopped(KeyboardInterrupt):
@@ -74,17 +75,18 @@ class Terminal:
     def _show(self, query: Query[C], shown: list[int]) -> None:
         """The candidates, numbered as they are shown."""
         candidates = [query.candidates[i] for i in shown]
-        if isinstance(candidates[0], Segment):
-            task = cast(ControlTask, self.task)
-            clips = [task.frames(c) for c in candidates if isinstance(c, Segment)]
+        kind = kind_of(candidates[0])
+        if kind.shows == "clip":
+            task = cast(DrawnTask[C], self.task)
+            clips = [task.frames(c) for c in candidates]
             path = write_clip(self.settings.clips / query.id[:12], clips, task.fps)
             order = ", ".join(str(n + 1) for n in range(len(shown)))
             self.console.print(Text(f"watch {path} (from left to right: {order})"))
             return
-        texts = [c for c in candidates if isinstance(c, Response)]
+        texts = [kind.shown(kind.describe(c)) for c in candidates]
         width = max(24, self.console.width // len(texts) - 2)
-        panels = [Panel(Text(visible(t.text)), title=str(n + 1), width=width) for n, t in enumerate(texts)]
-        self.console.print(Group(Text(visible(texts[0].prompt), style="bold"), Columns(panels, padding=(0, 1))))
+        panels = [Panel(Text(visible(t.text or "")), title=str(n + 1), width=width) for n, t in enumerate(texts)]
+        self.console.print(Group(Text(visible(texts[0].prompt or ""), style="bold"), Columns(panels, padding=(0, 1))))
 
     def _ask(self, count: int) -> str:
         """A line that can be interpreted; the rules are shown again after one that cannot."""

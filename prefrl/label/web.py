@@ -13,21 +13,19 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from prefrl.components import ConfigError, Settings, missing
+from prefrl.kinds import named
 from prefrl.label.checks import pick_checks
 from prefrl.page import api, static_files
 from prefrl.page.clips.queue import ClipSettings
 from prefrl.page.questions import Policy, Terms
-from prefrl.protocols import ControlTask, Store, Task
+from prefrl.protocols import DrawnTask, Store, Task
 from prefrl.types import C
 
 if TYPE_CHECKING:  # a run without people loads no web server
     from prefrl.page.site import Site
 
-QUESTIONS = {"control": "Which clip is better?", "text": "Which response is better?"}
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
-LOOKED_AT = {"control": 250, "text": 1000}
-"""Open queries whose candidates check questions are made of: segments are large, and stay in memory."""
 
 
 class Strengths(Settings):
@@ -161,7 +159,7 @@ class WebLabeler:
             raise ConfigError(f"labeler kind 'web': {missing(error)}") from error
         settings = self.settings
         place = Address(settings.host, settings.port, settings.allowed_hosts, settings.tls_cert, settings.tls_key)
-        clips = settings.clips if self.task.kind == "control" else None
+        clips = settings.clips if named(self.task.kind).shows == "clip" else None
         self._site = open_site(store, terms_of(settings, self.task, fixed), place, settings.name, clips)
         return self._site.notes
 
@@ -209,7 +207,7 @@ class WebLabeler:
             return
         # Noted, so that a wait without new questions files no second set of checks.
         self._checked, open_ids = asked, site.open_queries()
-        some = rng.permutation(len(open_ids))[: LOOKED_AT[self.task.kind]]
+        some = rng.permutation(len(open_ids))[: named(self.task.kind).looked_at]
         looked_at = [cast(Any, store).query(open_ids[i]) for i in sorted(some.tolist())]
         count = math.ceil(self.settings.check_share * len(open_ids))
         chosen = pick_checks(store, looked_at, count, rng)
@@ -219,18 +217,19 @@ class WebLabeler:
 
 def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
     """What a project asks and how, from its settings. `fixed`: no more will be asked than the store holds."""
-    clips = task.kind == "control"
+    kind = named(task.kind)
+    clips = kind.shows == "clip"
     page = api.Page(
         title=task.name,
-        question=settings.question or QUESTIONS[task.kind],
-        kind=cast(Literal["control", "text"], task.kind),
+        question=settings.question or kind.question,
+        kind=kind.name,
         strength=settings.strength,
         markdown=settings.markdown,
         minimum_watched=settings.minimum_watched if clips else 0.0,
         break_minutes=settings.break_minutes,
         ui_version=static_files.ui_version(static_files.static_files()),
     )
-    lease = settings.lease_seconds or (120.0 if clips else 600.0)
+    lease = settings.lease_seconds or kind.lease_seconds
     policy = Policy(settings.overlap, lease, settings.check_share, settings.repeat_share, settings.seed)
     return Terms(
         page=page,
@@ -238,7 +237,7 @@ def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
         strengths=dict(settings.strengths),
         guideline=settings.guideline,
         consent=settings.consent,
-        fps=cast(ControlTask, task).fps if clips else 0.0,
+        fps=cast(DrawnTask[Any], task).fps if clips else 0.0,
         fixed=fixed and not settings.stay_open,
         check_warn=settings.check_warn,
         check_pause=settings.check_pause,

@@ -14,6 +14,7 @@ from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
 from prefrl.exchange.exports.given import Exported
+from prefrl.kinds import named
 from prefrl.page import api
 from prefrl.page.access import Person
 from prefrl.page.api import Health, Link, Overview
@@ -43,7 +44,7 @@ def _add_overview(router: APIRouter) -> None:
     @router.get("/api/admin/export/{name}", responses=errors(401, 404), response_class=FileResponse)
     async def export(name: str, who: Admin, served: Served) -> FileResponse:
         """Judgements as a file; the header Prefrl-About says, as JSON, what it could not hold."""
-        known = EXPORTS[served.terms.page.kind]
+        known = named(served.terms.page.kind).exports
         if name not in known:
             raise Refused(404, f"there is no such export: choose from {', '.join(known)}")
         path, done = await run_in_threadpool(_export, served, name)
@@ -121,7 +122,7 @@ def _overview(served: Service) -> Overview:
         overlap=overlap,
         guideline=served.guideline,
         health=health,
-        exports=list(EXPORTS[served.terms.page.kind]),
+        exports=list(named(served.terms.page.kind).exports),
         **vars(figures),
     )
 
@@ -131,7 +132,7 @@ def _export(served: Service, name: str) -> tuple[Path, Exported]:
     from prefrl.exchange.ports import export
 
     folder = Path(tempfile.mkdtemp(prefix="prefrl-export-"))
-    path = folder / f"{name}{EXPORTS[served.terms.page.kind][name]}"
+    path = folder / f"{name}{named(served.terms.page.kind).exports[name]}"
     try:
         with Store[Any](served.store.folder, write=False) as store:
             done = export(store, path, name)
@@ -139,19 +140,3 @@ def _export(served: Service, name: str) -> tuple[Path, Exported]:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-
-
-EXPORTS: dict[str, dict[str, str]] = {
-    "text": {
-        "judgements": ".jsonl",
-        "preferences": ".jsonl",
-        "csv": ".csv",
-        "argilla": ".json",
-        "label-studio": ".json",
-        "arena": ".jsonl",
-        "dataset": "",
-        "bundle": "",
-    },
-    "control": {"bundle": "", "minari": ""},
-}
-"""The forms of `prefrl export` that a page of each kind offers, and how their files end; "" for folders."""

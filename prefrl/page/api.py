@@ -135,7 +135,7 @@ class Page(Plain):
     """What is judged, "Hopper-v5" say."""
     question: str
     """What is asked, in one sentence."""
-    kind: Literal["control", "text"]
+    kind: str
     strength: bool
     """Whether a preference can be slight, clear or much."""
     markdown: bool
@@ -197,7 +197,7 @@ class Item(Plain):
 class Assignment(Plain):
     assignment_id: Id
     query_id: str
-    kind: Literal["control", "text"]
+    kind: str
     prompt: str | None = None
     items: list[Item]
     """In the order of the slots: slot 0 stands left, or on top."""

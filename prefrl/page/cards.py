@@ -7,8 +7,9 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
+from prefrl.kinds import Shown, logged
 from prefrl.page import api, records
 from prefrl.page.questions import Given
 from prefrl.storage.log import EventLog
@@ -20,6 +21,10 @@ REMEMBERED = 1000
 def whole(text: str) -> str:
     """A text without halves of surrogate pairs, which cannot be sent: a model may break off within a character."""
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
+
+
+def _shown(candidate: dict[str, Any]) -> Shown:
+    return logged(candidate["type"]).shown(candidate)
 
 
 class ClipSource(Protocol):
@@ -41,9 +46,7 @@ class ClipSource(Protocol):
 class Cards:
     """Makes the cards. May be used from any thread; it reads from the disk what it does not remember."""
 
-    def __init__(
-        self, events: EventLog, kind: Literal["control", "text"], fps: float, lease: float, clips: ClipSource | None
-    ) -> None:
+    def __init__(self, events: EventLog, kind: str, fps: float, lease: float, clips: ClipSource | None) -> None:
         self._log, self._kind, self._fps, self._lease, self._clips = events, kind, fps, lease, clips
         self._known: OrderedDict[str, list[dict[str, Any]]] = OrderedDict()
         self._lock = threading.Lock()
@@ -60,21 +63,23 @@ class Cards:
 
     def _card(self, given: Given, candidates: list[dict[str, Any]]) -> api.Assignment:
         shown = [candidates[i] for i in given.shown]
+        prompt = _shown(shown[0]).prompt
         return api.Assignment(
             assignment_id=given.id,
             query_id=given.query,
             kind=self._kind,
-            prompt=whole(shown[0]["prompt"]) if "prompt" in shown[0] else None,
+            prompt=None if prompt is None else whole(prompt),
             items=[self._item(slot, candidate) for slot, candidate in enumerate(shown)],
             guideline=given.guideline,
             lease_seconds=self._lease,
         )
 
     def _item(self, slot: int, candidate: dict[str, Any]) -> api.Item:
-        if candidate["type"] == "response":
-            return api.Item(slot=slot, text=whole(candidate["text"]))
+        shown = _shown(candidate)
+        if shown.text is not None:
+            return api.Item(slot=slot, text=whole(shown.text))
         media = self._clips.names(candidate["id"]) if self._clips is not None else []
-        return api.Item(slot=slot, media=media, steps=candidate["steps"], fps=self._fps)
+        return api.Item(slot=slot, media=media, steps=shown.steps, fps=self._fps)
 
     def _candidates(self, queries: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
         with self._lock:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sql
@@ -19,6 +19,7 @@ from prefrl.page import api, records
 from prefrl.page.desk import Desk
 from prefrl.page.questions import Given, Question
 from prefrl.page.security import Refused
+from prefrl.storage.events import answer_body, answer_kind
 from prefrl.storage.log import Transaction, row
 from prefrl.storage.tables import assignment, canonical, submission
 from prefrl.store import Store
@@ -154,10 +155,8 @@ class Intake:
 
     def _file_repeat(self, tx: Transaction, given: Given, answer: Answer, about: dict[str, Any], again: bool) -> int:
         """An answer that nothing is learned from; the first one stays where it was."""
-        fields = {k: v for k, v in asdict(answer).items() if k not in ("query", "labeler")}
-        kind = {Comparison: "comparison", Ranking: "ranking", Skip: "skip"}[type(answer)]
         id = f"repeat:{given.id}" + (f":{about['submission']}" if again else "")
-        body = {"answer": {"kind": kind, **fields}, "about": about}
+        body = {"answer": {"kind": answer_kind(answer), **answer_body(answer)}, "about": about}
         return tx.append(row(id, "repeat", given.query, given.annotator, body))
 
 

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.fit.pairs import implied_pairs
-from prefrl.judgements import Answer, Choice, Ranking, Rating, Skip
+from prefrl.judgements import Answer, best_of, implied_pairs
 from prefrl.storage.events import ANSWER_TYPES, read_answer
 from prefrl.types import Floats
 
@@ -138,7 +137,7 @@ class Ledger:
             REPEAT if repeat else LABEL if asked.expected is None else CHECK,
             word(answer),
             first_shown(pairs, answer.shown),
-            UNKNOWN if asked.expected is None else best(answer) == asked.expected,
+            UNKNOWN if asked.expected is None else best_of(answer) == asked.expected,
             milliseconds / 1000,
             asked.clip,
             datetime.fromisoformat(event["at"]).timestamp(),
@@ -169,20 +168,20 @@ _READERS: dict[str, Callable[[Ledger, Mapping[str, Any]], None]] = {
 
 def said(answer: Answer, size: int) -> list[tuple[int, int, float]]:
     """(i, j, preference for i) with i < j, for each pair of `size` candidates that an answer speaks of."""
-    if isinstance(answer, Skip):
+    if answer.reason is not None:
         return []
     return [(i, j, p) if i < j else (j, i, 1 - p) for i, j, p in implied_pairs(answer, size)]
 
 
 def signature(answer: Answer, pairs: list[tuple[int, int, float]]) -> Signature:
     """What two answers to one query must have in common to be the same; see `Signature`."""
-    if isinstance(answer, Skip):
+    if answer.reason is not None:
         return "incomparable" if answer.reason == "incomparable" else None
     return tuple((i, j, float(p > 0.5) - float(p < 0.5)) for i, j, p in sorted(pairs))
 
 
 def word(answer: Answer) -> int:
-    if not isinstance(answer, Skip):
+    if answer.reason is None:
         return JUDGED
     return INCOMPARABLE if answer.reason == "incomparable" else SKIPPED
 
@@ -198,18 +197,3 @@ def first_shown(pairs: list[tuple[int, int, float]], shown: tuple[int, ...]) -> 
     if preference == 0.5:
         return TIE
     return LEFT if (preference > 0.5) == (shown[0] == i) else RIGHT
-
-
-def best(answer: Answer) -> int | None:
-    """The one candidate that an answer puts above every other; None where there is none."""
-    if isinstance(answer, Skip):
-        return None
-    if isinstance(answer, Choice):
-        return answer.best
-    if isinstance(answer, Ranking):
-        worth = [-rank for rank in answer.ranks]
-    elif isinstance(answer, Rating):
-        worth = list(answer.levels)
-    else:
-        worth = [int(np.sign(answer.preference - 0.5)), 0]
-    return worth.index(max(worth)) if worth.count(max(worth)) == 1 else None

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from sqlalchemy.exc import OperationalError
 from starlette.concurrency import run_in_threadpool
 
+from prefrl.kinds import named
 from prefrl.page import api, records
 from prefrl.page.access import Access, Event
 from prefrl.page.cards import Cards, ClipSource
@@ -206,7 +207,8 @@ class Service:
         """The figures for admins, made when the first one looks: a server is up in half the time without scipy."""
         from prefrl.page.figures import Dashboard
 
-        return Dashboard(self.terms.fps if self.terms.page.kind == "control" else None, self.terms.check_warn)
+        clips = named(self.terms.page.kind).shows == "clip"
+        return Dashboard(self.terms.fps if clips else None, self.terms.check_warn)
 
     @property
     def read_only(self) -> bool:

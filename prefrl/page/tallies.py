@@ -14,9 +14,9 @@ import numpy.typing as npt
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.judgements import Skip
+from prefrl.judgements import best_of
 from prefrl.page.api import AgreementRow, AnnotatorRow
-from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger, best
+from prefrl.page.ledger import CHECK, JUDGED, LABEL, LEFT, RIGHT, SKIPPED, TIE, Ledger
 from prefrl.stats.estimates import Estimate
 from prefrl.stats.intervals import position_test, share
 from prefrl.stats.raters import (
@@ -191,9 +191,5 @@ def attention(connection: Connection, name: str) -> Estimate:
         (read_answer(row.kind, row.subject, row.actor, row.body), row.expected)
         for row in connection.execute(sql.select(*columns).select_from(joined).where(mine))
     ]
-    hits = [
-        best(answer) == expected
-        for answer, expected in answers
-        if not (isinstance(answer, Skip) and answer.reason == "skip")
-    ]
+    hits = [best_of(answer) == expected for answer, expected in answers if answer.reason != "skip"]
     return share(sum(hits), len(hits), "no check question was answered")

@@ -9,6 +9,7 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from prefrl import types
+from prefrl.kinds import RESPONSES
 from prefrl.page import api, records
 from prefrl.page.access import Person
 from prefrl.page.people import errors, service_of, trainer
@@ -66,7 +67,7 @@ def trainer_routes() -> APIRouter:
     @router.put("/api/queries", responses=errors(401, 409, 413, 415, 422, 507))
     async def ask(sent: NewQueries, who: Trainer, served: Served) -> Filed:
         """Ask about texts. What was asked before is left alone."""
-        if served.terms.page.kind != "text":
+        if served.terms.page.kind != RESPONSES.name:
             raise Refused(409, "this project judges clips, which only its own run can ask about")
         queries = [_query(one) for one in sent.queries]
         await served.ask(queries)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
 from prefrl.policies.generate import Sampling, generate
-from prefrl.protocols import Task, TextTask
+from prefrl.protocols import TextTask
 from prefrl.seeding import generator
 from prefrl.types import Response, State
 
@@ -209,10 +208,3 @@ def pad_right(rows: Sequence[Sequence[int]], device: torch.device | None = None)
     width = max(map(len, rows))
     ids = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows], dtype=torch.int64, device=device)
     return ids, torch.tensor([len(row) for row in rows], device=device)
-
-
-def text(task: Task, kind: str) -> TextTask:
-    """A task, known to be of text. Raises `ConfigError` for others."""
-    if task.kind != "text":
-        raise ConfigError(f"learner kind {kind!r} writes text, but the task is of kind {task.kind!r}")
-    return cast(TextTask, task)

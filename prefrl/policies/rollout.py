@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from prefrl.components import ConfigError
-from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel, Task
+from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel
 from prefrl.types import Bools, Floats, Segment, State
 
 Act: TypeAlias = Callable[[Floats, Bools | None], tuple[Floats, Floats]]
@@ -135,13 +135,6 @@ def step_rewards(reward: RewardModel[Segment]) -> StepRewardModel:
             "use reward.kind=mlp"
         )
     return reward
-
-
-def control(task: Task, kind: str) -> ControlTask:
-    """A task, known to be of control. Raises `ConfigError` for others."""
-    if task.kind != "control":
-        raise ConfigError(f"learner kind {kind!r} acts in control tasks, but the task is of kind {task.kind!r}")
-    return cast(ControlTask, task)
 
 
 def _not_finite(observations: Floats, actions: Floats, t: int) -> str:

@@ -33,7 +33,7 @@ class Chapter:
 
 def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
     """All figures. Those of a text's drift are there only where the run measures it."""
-    drift = _drift(record) if facts.kind == "text" or facts.kl is not None else ()
+    drift = _drift(record) if facts.words.drifts or facts.kl is not None else ()
     return (
         Chapter("Did it help?", _learning(record) + drift),
         Chapter("Was the reward model right?", _fitting(record)),
@@ -142,7 +142,7 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
             "Queries asked, answered and skipped so far.",
         ),
         Card(
-            "Generated tokens" if facts.kind == "text" else "Environment steps",
+            f"{facts.words.spent}s".capitalize(),
             plots.lines("steps", at, [Line(record.series(f"steps/{n}"), c, n, d) for n, c, d in steps], zero=True),
             "Spent so far by purpose; every one is counted once.",
         ),

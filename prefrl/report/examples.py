@@ -12,9 +12,10 @@ from typing import Any, cast
 import numpy as np
 from PIL import Image
 
-from prefrl.protocols import ControlTask, Task
+from prefrl.kinds import kind_of
+from prefrl.protocols import DrawnTask, Task
 from prefrl.storage.files import write_file
-from prefrl.types import Candidate, Floats, Response, Segment, gold_score
+from prefrl.types import Candidate, Floats, gold_score
 
 FRAMES = 6
 GAP, GREY = 2, 215
@@ -24,7 +25,7 @@ HEIGHT = 160
 
 
 def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | None, folder: Path, name: str) -> Path:
-    """Write `examples/<name>.json` into a run's folder, with a PNG strip for each segment, and return its path.
+    """Write `examples/<name>.json` into a run's folder, with a PNG strip for each clip, and return its path.
 
     `learned` (N,) is the reward model's score of each example, None before there is a fitted one. Where frames
     cannot be drawn (no graphics library, no simulator states) the caption says so.
@@ -51,19 +52,22 @@ def strip(frames: np.ndarray, count: int = FRAMES) -> np.ndarray:
 
 
 def _show(task: Task, candidate: Candidate, place: Path, file: str) -> dict[str, Any]:
-    if isinstance(candidate, Response):
-        return {"prompt": candidate.prompt, "text": candidate.text}
+    kind = kind_of(candidate)
+    shown = kind.shown(kind.describe(candidate))
+    if shown.text is not None:
+        return {"prompt": shown.prompt, "text": shown.text}
+    drawn = cast(DrawnTask[Candidate], task)
     try:
-        frames = cast(ControlTask, task).frames(candidate)
+        frames = drawn.frames(candidate)
     except Exception as error:  # a renderer may raise anything, and a missing picture must not end a run
         return {"caption": f"No picture: drawing failed with {type(error).__name__}: {error}"}
     _save(strip(frames), place / file)
-    return {"strip": file, "caption": _caption(cast(ControlTask, task), candidate)}
+    return {"strip": file, "caption": _caption(drawn, shown.steps)}
 
 
-def _caption(task: ControlTask, segment: Segment) -> str:
-    seconds = len(segment) / task.fps
-    return f"{len(segment)} steps, {seconds:.1f} s of simulated time, from left to right"
+def _caption(task: DrawnTask[Any], steps: int) -> str:
+    seconds = steps / task.fps
+    return f"{steps} steps, {seconds:.1f} s of simulated time, from left to right"
 
 
 def _save(picture: np.ndarray, path: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from prefrl.evaluate.summary import STAGES
+from prefrl.kinds import RESPONSES, SEGMENTS, Kind, find
 from prefrl.report.records import Record, mapping, number, visible, whole
 
 
@@ -33,6 +35,11 @@ class Facts:
     total_seconds: float | None
     versions: Mapping[str, str]
 
+    @property
+    def words(self) -> Kind[Any]:
+        """What people call things where candidates are of this kind; those of control where it is not known."""
+        return find(self.kind) or SEGMENTS
+
 
 def gather(record: Record) -> Facts:
     """The run's facts: the summary's where it has them, else what the rounds say so far."""
@@ -52,7 +59,7 @@ def gather(record: Record) -> Facts:
 
     return Facts(
         task=visible(summary.get("task") or record.name, 200),
-        kind=visible(summary.get("kind") or ("text" if any(v is not None for v in fluency) else ""), 20),
+        kind=visible(summary.get("kind") or (RESPONSES.name if any(v is not None for v in fluency) else ""), 20),
         finished=bool(summary) and rounds >= (record.planned or 0),
         rounds=rounds,
         planned=record.planned,

@@ -9,7 +9,7 @@ def headline(facts: Facts) -> str:
     """What happened, in one plain sentence."""
     spent = [
         show_count(facts.labels["answered"], "label") if facts.labels["answered"] is not None else "",
-        show_count(sum(v or 0 for v in facts.steps.values()), _unit(facts.kind)) if any(facts.steps.values()) else "",
+        show_count(sum(v or 0 for v in facts.steps.values()), facts.words.spent) if any(facts.steps.values()) else "",
         show_time(facts.total_seconds) if facts.total_seconds else "",
     ]
     cost = ", ".join(word for word in spent if word)
@@ -34,7 +34,7 @@ def verdict(facts: Facts) -> str:
         if after < before:
             remarks.append("The policy got worse.")
         if after != before and spreads and abs(after - before) < min(spreads):
-            what = "responses" if facts.kind == "text" else "episodes"
+            what = f"{facts.words.behaviour}s"
             remarks.append(f"The change is smaller than one standard deviation between {what}.")
         if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
@@ -46,10 +46,6 @@ def verdict(facts: Facts) -> str:
             change = "fell" if end < start else "rose"
             remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
     return " ".join(remarks)
-
-
-def _unit(kind: str) -> str:
-    return "generated token" if kind == "text" else "environment step"
 
 
 def show_number(value: float | None, beside: float | None = None) -> str:

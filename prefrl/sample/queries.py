@@ -8,14 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from prefrl.types import C, Candidate, Floats, Integers, Query, Segment
+from prefrl.kinds import kind_of
+from prefrl.types import C, Candidate, Floats, Integers, Query
 
 
 def overlap(a: Candidate, b: Candidate) -> bool:
-    """Whether two segments share steps of one episode; responses never do."""
-    if not (isinstance(a, Segment) and isinstance(b, Segment)) or a.episode != b.episode:
-        return False
-    return a.start < b.start + len(b) and b.start < a.start + len(a)
+    """Whether two candidates of a pool share a part, as two segments of one episode may."""
+    return kind_of(a).overlap(a, b)
 
 
 def newest(pool: Sequence[C], share: float) -> list[C]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.judgements import Answer, Comparison
+from prefrl.judgements import Answer, same
 from prefrl.storage.engines import StoreError
 from prefrl.storage.events import (
     check_answer,
@@ -165,23 +165,16 @@ def contradiction(one: Event, here: Event) -> str:
         return "" if len(set(purposes)) == 1 else f"query {one['id'][:12]} is a check question on one side alone"
     if one["kind"] == here["kind"] and one["kind"] in ("candidate", "retract"):
         return ""  # their ids say all there is
-    same = all(one[name] == here[name] for name in ("kind", "subject", "actor", "body"))
-    return "" if same else f"event {one['id'][:40]!r} says something else than the one of this id in the store"
+    alike = all(one[name] == here[name] for name in ("kind", "subject", "actor", "body"))
+    return "" if alike else f"event {one['id'][:40]!r} says something else than the one of this id in the store"
 
 
 def otherwise(answer: Answer, stands: Answer) -> str:
     """That a labeler has judged a query otherwise before; "" where an answer says what stands, or less."""
     answer = answer if answer.shown else replace(answer, shown=stands.shown)
-    if isinstance(answer, Comparison) and isinstance(stands, Comparison):
-        # A file that counts from the other side holds 1 - p, which has been rounded.
-        answer = replace(answer, preference=stands.preference) if _close(answer, stands) else answer
-    if answer == stands:
+    if same(answer, stands):
         return ""
     return f"{stands.labeler!r} has judged query {stands.query[:12]} otherwise before: {stands}"
-
-
-def _close(one: Comparison, other: Comparison) -> bool:
-    return abs(one.preference - other.preference) < 1e-9
 
 
 def _answer(one: Event, kind: str, body: Event) -> Answer:

@@ -5,23 +5,21 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, check_fits, is_whole
-from prefrl.storage.blobs import read_arrays
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, check_fits
+from prefrl.kinds import kind_of, logged
+from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.engines import StoreError
 from prefrl.storage.projection import ANSWERS
-from prefrl.types import Candidate, Response, Segment
+from prefrl.types import LARGEST, Candidate, is_whole
 
 ANSWER_TYPES: dict[str, type[Answer]] = dict(zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Skip), strict=True))
 PORTABLE = ("candidate", "query", *ANSWERS, "retract", "assign", "repeat", "guideline", "flag")
 """Kinds that a copy for others holds: what was asked and answered, not who may come in or how the project is set."""
-LARGEST = 2**31 - 1
-"""The largest whole number in an event from elsewhere: every database and every table holds it."""
 LEVELS = 10_000
 """Levels of a rating scale at most: a fit has a threshold between each two of them."""
 DEEPEST = 20
@@ -40,23 +38,32 @@ _IDS = {
 
 def describe(candidate: Candidate) -> dict[str, Any]:
     """A candidate without its arrays and its gold."""
-    if isinstance(candidate, Segment):
-        return {"type": "segment", "episode": candidate.episode, "start": candidate.start, "steps": len(candidate)}
-    tokens = {"prompt_tokens": list(candidate.prompt_tokens), "tokens": list(candidate.tokens)}
-    return {"type": "response", "prompt": candidate.prompt, "text": candidate.text, **tokens}
+    kind = kind_of(candidate)
+    return {"type": kind.noun, **kind.describe(candidate)}
+
+
+def write_candidate(candidate: Candidate, blobs: Path) -> None:
+    """Write the arrays that a candidate's description does not hold, if there are any."""
+    if arrays := kind_of(candidate).arrays(candidate):
+        write_arrays(blobs, candidate.id, arrays)
 
 
 def load_candidate(id: str, body: dict[str, Any], blobs: Path) -> Any:
     """A candidate from its description, and its arrays if it has any; its content must have the id it goes by."""
-    loaded: Candidate
-    if body["type"] == "response":
-        loaded = Response(body["prompt"], body["text"], tuple(body["prompt_tokens"]), tuple(body["tokens"]))
-    else:
-        x = read_arrays(blobs, id)
-        loaded = Segment(x["observations"], x["actions"], body["episode"], body["start"], x.get("states"))
+    loaded = logged(body["type"]).load(body, lambda: read_arrays(blobs, id))
     if loaded.id != id:
         raise StoreError(f"candidate {id[:12]} has changed since it was filed: its sha256 is now {loaded.id[:12]}")
     return loaded
+
+
+def answer_kind(answer: Answer) -> str:
+    """The kind of the event that holds an answer."""
+    return next(kind for kind, cls in ANSWER_TYPES.items() if isinstance(answer, cls))
+
+
+def answer_body(answer: Answer) -> dict[str, Any]:
+    """What the event that holds an answer says beside its query and its labeler."""
+    return {name: value for name, value in asdict(answer).items() if name not in ("query", "labeler")}
 
 
 def read_answer(kind: str, query: str, labeler: str, body: dict[str, Any]) -> Answer:
@@ -77,7 +84,7 @@ def check_answer(answer: Answer, size: int) -> None:
     check_text("labeler", answer.labeler)
     if answer.shown and not _is_order(answer.shown, size):
         raise ValueError(f"shown: expected each of 0 to {size - 1} once, got {answer.shown!r:.200}")
-    if not isinstance(answer, Skip) and not _is_finite(answer.weight):
+    if answer.reason is None and not _is_finite(answer.weight):
         raise ValueError(f"weight: expected a finite number, got {answer.weight!r:.40}")
     match answer:
         case Comparison(preference=preference):
@@ -176,15 +183,8 @@ def check_purpose(body: Mapping[str, Any], size: int) -> None:
 def load_foreign(id: str, body: dict[str, Any], blobs: Path) -> Candidate:
     """`load_candidate` for one from elsewhere. Raises `StoreError` where a part of it is not of its kind."""
     loaded: Candidate = load_candidate(id, body, blobs)
-    if body != describe(loaded) or not all(isinstance(body.get(n, ""), str) for n in ("prompt", "text", "episode")):
+    if body != describe(loaded):
         raise StoreError(f"candidate {id[:12]} is not described as it is: {body!r:.200}")
-    if isinstance(loaded, Segment):
-        if not is_whole(loaded.start, LARGEST):
-            raise StoreError(f"candidate {id[:12]} starts at step {loaded.start!r:.40}; expected a number from 0 on")
-        for name in ("observations", "actions"):
-            array = getattr(loaded, name)
-            if array.dtype.kind != "f" or not np.isfinite(array).all():
-                raise StoreError(f"candidate {id[:12]}: its {name} are not all finite floats")
-    elif not all(is_whole(token, LARGEST) for token in (*loaded.prompt_tokens, *loaded.tokens)):
-        raise StoreError(f"candidate {id[:12]} has tokens that are no numbers from 0 on")
+    if fault := kind_of(loaded).fault(loaded):
+        raise StoreError(f"candidate {id[:12]} {fault}")
     return loaded

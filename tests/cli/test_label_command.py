@@ -79,7 +79,7 @@ def test_given_candidates_are_checked(prefrl: Shell, row: str, message: str) -> 
     assert prefrl("label text/toy --given given.jsonl --out labels") == 2
     assert message in prefrl.err
     assert prefrl("label control/toy --given given.jsonl --out other") == 2
-    assert "is no text task" in prefrl.err
+    assert "holds responses to prompts, but the task is of kind 'control'" in prefrl.err
 
 
 def test_asking_for_more_labels_asks_for_the_rest(prefrl: Shell) -> None:

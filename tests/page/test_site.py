@@ -6,6 +6,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,7 @@ from web_service import answering, ask_for, log_in
 
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
+from prefrl.kinds import SEGMENTS
 from prefrl.label import web
 from prefrl.label.web import WebLabeler, WebSettings
 from prefrl.page import site
@@ -229,7 +231,7 @@ def make(number: int) -> Query[Segment]:
 def test_only_a_part_of_the_segments_is_loaded_to_choose_checks(
     store: Store[Any], share: float, loaded: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(web.LOOKED_AT, "control", 20)
+    monkeypatch.setattr(web, "named", lambda _: replace(SEGMENTS, looked_at=20))
     store.ask([make(number) for number in range(60)])
     labeler = WebSettings(port=0, check_share=share).build(PointSettings().build())
     labeler.open(store)

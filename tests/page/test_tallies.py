@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from made_log import NOW, Made, sweep
 
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, best_of
 from prefrl.page import tallies
 from prefrl.page.api import AnnotatorRow
-from prefrl.page.ledger import LEFT, RIGHT, TIE, UNKNOWN, best, first_shown, said
+from prefrl.page.ledger import LEFT, RIGHT, TIE, UNKNOWN, first_shown, said
 from prefrl.stats.intervals import position_test, share
 
 Generator = np.random.Generator
@@ -43,7 +43,7 @@ def made() -> Made:
 )
 def test_what_one_answer_says_of_places_and_of_the_best(answer: Answer, size: int, first: int, winner: Any) -> None:
     assert first_shown(said(answer, size), answer.shown) == first
-    assert best(answer) == winner
+    assert best_of(answer) == winner
 
 
 # --- one person ----------------------------------------------------------------------------------------------------

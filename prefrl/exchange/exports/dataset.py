@@ -18,14 +18,14 @@ from prefrl.exchange.exports.given import (
     WEIGHT,
     WHOLE,
     Exported,
-    Given,
     Tally,
     each_answer,
     json_text,
     knows_strengths,
 )
 from prefrl.exchange.exports.rows import each_judgement, each_pair, margin
-from prefrl.judgements import Comparison, Skip
+from prefrl.judgements import Comparison
+from prefrl.storage.events import answer_kind
 from prefrl.storage.files import whole_folder, write_file
 from prefrl.storage.log import StoreError
 from prefrl.storage.projection import chunks
@@ -144,17 +144,13 @@ def _figures(store: Store[Any]) -> tuple[dict[str, int], int, str]:
     """Answers by kind, how many annotators there are, and how often two of them agree."""
     kinds, labelers, sides = dict[str, int](), set[str](), dict[str, list[int]]()
     for given in each_answer(store):
-        name = _kind(given)
+        name = given.answer.reason or answer_kind(given.answer)
         kinds[name] = kinds.get(name, 0) + 1
         labelers.add(given.answer.labeler.partition("#")[0])
         if isinstance(given.answer, Comparison):
             preference = given.answer.preference
             sides.setdefault(given.query.id, []).append((preference > 0.5) - (preference < 0.5))
     return kinds, len(labelers), _agreement(sides.values())
-
-
-def _kind(given: Given) -> str:
-    return given.answer.reason if isinstance(given.answer, Skip) else type(given.answer).__name__.lower()
 
 
 def _agreement(sides: Iterable[list[int]]) -> str:

@@ -15,7 +15,8 @@ from typing import IO, Any, NamedTuple
 
 import sqlalchemy as sql
 
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.judgements import Answer, columns, is_pairwise, is_soft
+from prefrl.kinds import kind_of, only
 from prefrl.storage.events import load_candidate, read_answer
 from prefrl.storage.files import make_folder, sync_folder
 from prefrl.storage.log import StoreError
@@ -45,8 +46,6 @@ OF_EVENTS = {
 }
 """Events that are no answers, as they are called in a tally."""
 CHECK = "check question"
-CERTAIN = (0.0, 0.5, 1.0)
-"""Preferences that say nothing of how strong they are."""
 
 
 class Given(NamedTuple):
@@ -103,8 +102,8 @@ def _answers_to(connection: sql.Connection, ids: Collection[str]) -> Iterator[sq
 def knows_strengths(store: Store[Any]) -> bool:
     """Whether any preference is neither a tie nor a certainty."""
     with store.log.reading() as connection:
-        comparisons = (e for some in _standing(connection) for e in some if e["kind"] == "comparison")
-        return any(e["body"]["preference"] not in CERTAIN for e in comparisons)
+        found = (e for some in _standing(connection) for e in some)
+        return any(is_soft(read_answer(e["kind"], e["subject"], e["actor"], e["body"])) for e in found)
 
 
 def _standing(connection: sql.Connection) -> Iterator[list[dict[str, Any]]]:
@@ -126,8 +125,8 @@ def stored_queries(connection: sql.Connection, ids: Collection[str], blobs: Path
 
 def refuse_segments(given: Given, form: str) -> None:
     """Raise `StoreError` where a form for texts would have to hold segments."""
-    if not isinstance(given.query.candidates[0], Response):
-        raise StoreError(f"judgements of control segments do not fit the form {form!r}; use --form bundle or minari")
+    error = StoreError(f"judgements of control segments do not fit the form {form!r}; use --form bundle or minari")
+    only(Response, given.query.candidates, error)
 
 
 @dataclass
@@ -141,23 +140,22 @@ class Tally:
     def note(self, given: Given) -> None:
         """Count what of an answer has no place in the form."""
         answer = given.answer
-        weight = 1.0 if isinstance(answer, Skip) else answer.weight
-        soft = isinstance(answer, Comparison) and answer.preference not in CERTAIN
+        weight = answer.weight if answer.reason is None else 1.0
         has = {
             LABELER: bool(answer.labeler),
             ORDER: bool(answer.shown),
             TIME: True,
             WEIGHT: weight != 1.0,
-            STRENGTH: soft,
+            STRENGTH: is_soft(answer),
             ABOUT: bool(given.about),
-            TOKENS: any(isinstance(c, Response) and c.tokens for c in given.query.candidates),
-            WHOLE: not isinstance(answer, Comparison | Skip),
+            TOKENS: any(kind_of(c).tokens(c) for c in given.query.candidates),
+            WHOLE: not is_pairwise(answer),
         }
         self.dropped.update(name for name, there in has.items() if there and name not in self.holds)
 
-    def skip(self, answer: Skip) -> None:
+    def skip(self, reason: str) -> None:
         """Count a skip that has no place in the form."""
-        self.dropped[INCOMPARABLE if answer.reason == "incomparable" else SKIP] += 1
+        self.dropped[INCOMPARABLE if reason == "incomparable" else SKIP] += 1
 
     def done(self, store: Store[Any], written: int, *notes: str) -> Exported:
         """The tally, with what the store holds beside answers."""
@@ -170,26 +168,11 @@ class Tally:
         return Exported(written, {name: count for name, count in self.dropped.items() if count}, notes)
 
 
-def verdict(answer: Answer) -> dict[str, Any]:
-    """The answer as the columns of a row that lists its responses in the query's order."""
-    match answer:
-        case Comparison(preference=preference):
-            return {"preference": preference}
-        case Ranking(ranks=ranks):
-            return {"ranks": list(ranks)}
-        case Choice(best=best):
-            return {"best": best}
-        case Rating(levels=levels, scale=scale):
-            return {"ratings": list(levels), "scale": scale}
-        case Skip(reason=reason):
-            return {"skip": reason}
-
-
 def told(given: Given) -> dict[str, Any]:
     """The answer, and by whom, when and how it was given, as columns of a row."""
     answer = given.answer
-    weight = {} if isinstance(answer, Skip) else {"weight": answer.weight}
-    return verdict(answer) | {"labeler": answer.labeler, "shown": list(answer.shown)} | weight | {"at": given.at}
+    weight = {"weight": answer.weight} if answer.reason is None else {}
+    return columns(answer) | {"labeler": answer.labeler, "shown": list(answer.shown)} | weight | {"at": given.at}
 
 
 def json_text(value: Any) -> str:

@@ -22,6 +22,7 @@ from prefrl.exchange.exports.given import (
     told,
     write_lines,
 )
+from prefrl.kinds import only
 from prefrl.storage.files import whole_folder
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
@@ -58,10 +59,9 @@ def export_minari(store: Store[Any], path: Path) -> Exported:
 def _segments(store: Store[Any]) -> Iterator[Segment]:
     """Every segment that was judged or skipped, once."""
     seen = set[str]()
+    error = StoreError("responses are no trajectories, and do not fit Minari; use another form")
     for given in each_answer(store):
-        for segment in given.query.candidates:
-            if not isinstance(segment, Segment):
-                raise StoreError("responses are no trajectories, and do not fit Minari; use another form")
+        for segment in only(Segment, given.query.candidates, error):
             if segment.id not in seen:
                 seen.add(segment.id)
                 yield segment

@@ -26,8 +26,7 @@ from prefrl.exchange.exports.given import (
     write_lines,
 )
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
-from prefrl.fit.pairs import implied_pairs
-from prefrl.judgements import Rating, Skip
+from prefrl.judgements import good, implied_pairs
 from prefrl.store import Store
 from prefrl.types import Response
 
@@ -74,13 +73,14 @@ def each_pair(store: Store[Any], tally: Tally, form: str) -> Iterator[Pair]:
     for given in each_answer(store):
         refuse_segments(given, form)
         tally.note(given)
-        if isinstance(given.answer, Skip):
-            tally.skip(given.answer)
+        answer = given.answer
+        if answer.reason is not None:
+            tally.skip(answer.reason)
             continue
         texts = given.query.candidates
         if len(texts) == 1:
             tally.dropped[ALONE] += 1
-        for i, j, preference in implied_pairs(given.answer, len(texts)):
+        for i, j, preference in implied_pairs(answer, len(texts)):
             better, worse = (i, j) if preference >= 0.5 else (j, i)
             yield Pair(given, texts[better], texts[worse], max(preference, 1.0 - preference))
 
@@ -134,30 +134,17 @@ def _unpaired(store: Store[Any], tally: Tally, say: Conversations) -> Iterator[d
         refuse_segments(given, "unpaired")
         tally.note(given)
         tally.dropped[WHOLE] = 0
-        if isinstance(given.answer, Skip):
-            tally.skip(given.answer)
+        answer = given.answer
+        if answer.reason is not None:
+            tally.skip(answer.reason)
             continue
-        for response, label in zip(given.query.candidates, _labels(given), strict=True):
+        texts = given.query.candidates
+        for response, label in zip(texts, good(answer, len(texts)), strict=True):
             if label is None:
                 tally.dropped[MIDDLE] += 1
             else:
                 row = {"prompt": say.prompt(response.prompt), "completion": say.response(response.text)}
                 yield row | {"label": label}
-
-
-def _labels(given: Given) -> list[bool | None]:
-    """For each candidate whether it is good; None where that is not said."""
-    answer, size = given.answer, len(given.query.candidates)
-    if isinstance(answer, Rating):
-        middle = (answer.scale - 1) / 2
-        return [None if level == middle else level > middle for level in answer.levels]
-    assert not isinstance(answer, Skip)
-    better, worse = set[int](), set[int]()
-    for i, j, preference in implied_pairs(answer, size):
-        if preference != 0.5:
-            better.add(i if preference > 0.5 else j)
-            worse.add(j if preference > 0.5 else i)
-    return [None if (k in better) == (k in worse) else k in better for k in range(size)]
 
 
 def export_judgements(store: Store[Any], path: Path) -> Exported:

@@ -10,7 +10,6 @@ from typing import IO, Any
 from prefrl.exchange.exports.given import LABELER, STRENGTH, TIME, WEIGHT, Exported, Tally, whole_file
 from prefrl.exchange.exports.rows import Pair, each_pair
 from prefrl.exchange.guard import GUARDED, guarded
-from prefrl.judgements import Skip
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
 
@@ -51,7 +50,7 @@ def _write(store: Store[Any], tally: Tally, file: IO[bytes]) -> tuple[int, int]:
 
 def _row(pair: Pair) -> dict[str, str]:
     answer, query = pair.given.answer, pair.given.query
-    assert not isinstance(answer, Skip)
+    assert answer.reason is None
     return {
         "prompt": pair.chosen.prompt,
         "chosen": pair.chosen.text,

@@ -24,8 +24,7 @@ from prefrl.exchange.exports.given import (
 from prefrl.exchange.exports.rows import ALONE, UNTOLD
 from prefrl.exchange.tool_rows import user_id
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
-from prefrl.fit.pairs import implied_pairs
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Skip
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Skip, implied_pairs
 from prefrl.store import Store
 from prefrl.types import Response
 
@@ -109,9 +108,9 @@ def _tasks(group: Sequence[Given], tally: Tally) -> list[dict[str, Any]]:
     """A task for each pair of a query's responses that was judged."""
     texts, pairs = group[0].query.candidates, dict[tuple[int, int], list[dict[str, Any]]]()
     for given in group:
-        if isinstance(given.answer, Skip) and len(texts) != 2:
-            tally.skip(given.answer)
-        tally.dropped[ALONE] += len(texts) == 1 and not isinstance(given.answer, Skip)
+        if given.answer.reason is not None and len(texts) != 2:
+            tally.skip(given.answer.reason)
+        tally.dropped[ALONE] += len(texts) == 1 and given.answer.reason is None
         for i, j, result, cancelled in _results(given.answer, len(texts)):
             better_first = (i, j) if i < j else (j, i)
             if i > j:
@@ -130,7 +129,7 @@ def _task(query: str, left: Response, right: Response, annotations: list[dict[st
 
 def _results(answer: Answer, size: int) -> list[tuple[int, int, list[dict[str, Any]], bool]]:
     """(left, right, result, whether it was cancelled) for each pair that an answer speaks of."""
-    if isinstance(answer, Skip):
+    if answer.reason is not None:
         outcome = [] if answer.reason == "skip" else [_choice("incomparable")]
         return [(0, 1, outcome, answer.reason == "skip")] if size == 2 else []
     found = []
@@ -172,9 +171,9 @@ def _battles(store: Store[Any], tally: Tally, untold: set[str]) -> Iterator[dict
         refuse_segments(given, "arena")
         tally.note(given)
         texts, answer = given.query.candidates, given.answer
-        if isinstance(answer, Skip):
+        if answer.reason is not None:
             if answer.reason == "skip" or len(texts) != 2:
-                tally.skip(answer)
+                tally.skip(answer.reason)
             else:
                 yield _battle(given, texts, "tie (bothbad)", untold)
             continue

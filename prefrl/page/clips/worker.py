@@ -23,11 +23,11 @@ from typing import Any, TextIO, cast
 import yaml
 
 from prefrl.components import settings_class
+from prefrl.kinds import kind_of, named
 from prefrl.page.clips.encode import NAME, encode
-from prefrl.protocols import ControlTask, TaskSettings
+from prefrl.protocols import DrawnTask, TaskSettings
 from prefrl.storage.files import write_file
 from prefrl.store import Store
-from prefrl.types import Segment
 
 GRACE = 5.0
 """Seconds after a job's limit at which the process ends itself, should nobody have ended it."""
@@ -44,7 +44,7 @@ class Artist:
     """Draws the candidates of one store, by the task that the folder's settings name."""
 
     folder: Path
-    _store: Store[Segment] | None = field(default=None, init=False)
+    _store: Store[Any] | None = field(default=None, init=False)
 
     def draw(self, candidate: str, file: str) -> int:
         """Write the clip of a candidate; returns its bytes. Raises `ValueError` where it cannot be drawn."""
@@ -54,26 +54,26 @@ class Artist:
         place = self.folder / "clips" / file[:2]
         if place.is_symlink():
             raise JobError(f"{place} is a link, which is not followed: remove it")
-        segment: object = self._opened().candidate(candidate)
-        if not isinstance(segment, Segment):
+        found = self._opened().candidate(candidate)
+        if kind_of(found).shows != "clip":
             raise JobError("a text has no clip")
-        data = encode(self._task.frames(segment), self._task.fps, name[2])
+        data = encode(self._task.frames(found), self._task.fps, name[2])
         write_file(place / file, data)
         return len(data)
 
     @cached_property
-    def _task(self) -> ControlTask:
+    def _task(self) -> DrawnTask[Any]:
         """Built from its part of the settings alone: the rest would load what only training needs."""
         path = self.folder / "config.yaml"
         if not path.is_file():
             raise JobError(f"{self.folder} holds no run: expected a file config.yaml in it")
         chosen = yaml.safe_load(path.read_text(encoding="utf-8"))["task"]
         task = cast(TaskSettings, settings_class("tasks", chosen["kind"]).model_validate(chosen)).build()
-        if task.kind != "control":
+        if named(task.kind).shows != "clip":
             raise JobError(f"the task {task.name} is of kind {task.kind!r}, and has no clips")
-        return cast(ControlTask, task)
+        return cast(DrawnTask[Any], task)
 
-    def _opened(self) -> Store[Segment]:
+    def _opened(self) -> Store[Any]:
         if self._store is None:
             self._store = Store(self.folder, write=False)
         return self._store

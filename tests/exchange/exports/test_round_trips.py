@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from prefrl.exchange.ports import export, import_judgements
 from prefrl.exchange.transcripts import prompt_text
-from prefrl.fit.pairs import implied_pairs
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, implied_pairs
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
 
