@@ -29,6 +29,7 @@ from prefrl.protocols import (
     TaskSettings,
 )
 from prefrl.seeding import device_of, streams
+from prefrl.types import Json
 
 if TYPE_CHECKING:
     from prefrl.store import Store
@@ -93,7 +94,7 @@ class Config(Settings):
         return cls.parse(data)
 
     @classmethod
-    def parse(cls, data: dict[str, Any]) -> Config:
+    def parse(cls, data: Json) -> Config:
         """Check a nested dict. Raises `ConfigError`."""
         try:
             return cls.model_validate(data)
@@ -165,7 +166,7 @@ def _first_comment(file: Traversable) -> str:
     return file.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
 
 
-def _read(source: str | Path) -> dict[str, Any]:
+def _read(source: str | Path) -> Json:
     """The settings in a file, or in a preset of that name."""
     path = Path(source)
     if path.is_file():
@@ -194,7 +195,7 @@ class _UniqueKeys(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _apply(data: dict[str, Any], override: str) -> None:
+def _apply(data: Json, override: str) -> None:
     """Set one `dotted.key=value`. A new kind drops the settings of the old one, which it may not know."""
     path, sign, text = override.partition("=")
     if not sign or not path:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, ClassVar, Generic, Literal, TypeAlias
+from typing import ClassVar, Generic, Literal, TypeAlias
 
-from prefrl.types import C, Query, is_whole
+from prefrl.types import C, Json, Query, is_whole
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def same(one: Answer, other: Answer) -> bool:
     return one == other
 
 
-def columns(answer: Answer) -> dict[str, Any]:
+def columns(answer: Answer) -> Json:
     """The answer as the columns of a row that lists its candidates in the query's order."""
     match answer:
         case Comparison(preference=preference):

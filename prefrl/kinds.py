@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from prefrl.components import suggest
-from prefrl.types import LARGEST, C, Candidate, Response, Segment, is_whole
+from prefrl.types import LARGEST, C, Candidate, Fields, Json, Response, Segment, is_whole
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
@@ -43,9 +43,9 @@ class Kind(Generic[C]):
     """What one is called, also in the log; more than one with an s behind it."""
 
     # --- stored ---
-    describe: Callable[[C], dict[str, Any]]
+    describe: Callable[[C], Json]
     """Without its arrays and its gold, as JSON holds it."""
-    load: Callable[[Mapping[str, Any], Callable[[], Arrays]], C]
+    load: Callable[[Fields, Callable[[], Arrays]], C]
     """From its description, and a function that reads its arrays."""
     arrays: Callable[[C], Arrays] = lambda _: {}
     """What is kept in a file of its own; nothing where the description says all."""
@@ -82,7 +82,7 @@ class Kind(Generic[C]):
     # --- shown ---
     shows: Literal["clip", "text"] = "text"
     """A clip is drawn by the task, and text is there already."""
-    shown: Callable[[Mapping[str, Any]], Shown] = lambda _: Shown()
+    shown: Callable[[Fields], Shown] = lambda _: Shown()
     """From its description."""
     question: str = "Which is better?"
     lease_seconds: float = 120.0
@@ -109,7 +109,7 @@ def _are_text(*values: object) -> bool:
 # --- segments -------------------------------------------------------------------------------------------------------
 
 
-def _load_segment(body: Mapping[str, Any], read: Callable[[], Arrays]) -> Segment:
+def _load_segment(body: Fields, read: Callable[[], Arrays]) -> Segment:
     x = read()
     return Segment(x["observations"], x["actions"], body["episode"], body["start"], x.get("states"))
 
@@ -176,12 +176,12 @@ SEGMENTS = Kind(
 # --- responses ------------------------------------------------------------------------------------------------------
 
 
-def _describe_response(one: Response) -> dict[str, Any]:
+def _describe_response(one: Response) -> Json:
     tokens = {"prompt_tokens": list(one.prompt_tokens), "tokens": list(one.tokens)}
     return {"prompt": one.prompt, "text": one.text, **tokens}
 
 
-def _load_response(body: Mapping[str, Any], read: Callable[[], Arrays]) -> Response:
+def _load_response(body: Fields, read: Callable[[], Arrays]) -> Response:
     return Response(body["prompt"], body["text"], tuple(body["prompt_tokens"]), tuple(body["tokens"]))
 
 

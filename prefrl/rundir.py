@@ -26,7 +26,7 @@ from prefrl.seeding import streams
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.storage.files import MANIFEST, DamagedError, verify, whole_folder, write_file
 from prefrl.store import Store
-from prefrl.types import Fitted, Round
+from prefrl.types import Fitted, Json, Round
 
 KEEP = 2
 """Checkpoints kept: if the newest is damaged, the one before it serves."""
@@ -90,7 +90,7 @@ class Run:
             yield round
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Json:
         """What came out, as in `summary.json`."""
         return summarise(self._rows, self.loop.task, self.config.seed)
 
@@ -162,7 +162,7 @@ class Run:
         for old in _checkpoints(self.folder)[KEEP:]:  # only once the new one stands
             shutil.rmtree(old)
 
-    def _restore(self) -> list[dict[str, Any]]:
+    def _restore(self) -> list[Json]:
         """Load the newest good checkpoint, and the rows of metrics up to it.
 
         Labels that came after that checkpoint stay in the store, and count from the next fit on.
@@ -260,7 +260,7 @@ def _difference(a: Settings, b: Settings) -> str:
     return f"{key} is {flat_a.get(key)} there, {flat_b.get(key)} here"
 
 
-def _flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(tree: Json, prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in tree.items():
         if isinstance(value, dict):
             yield from _flatten(value, f"{prefix}{key}.")

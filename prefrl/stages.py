@@ -29,7 +29,7 @@ from prefrl.seeding import streams
 from prefrl.storage.checkpoints import load_state
 from prefrl.storage.files import check_free, read_lines, write_file
 from prefrl.store import Store
-from prefrl.types import Evaluation, Fitted, Query, Response
+from prefrl.types import Evaluation, Fitted, Json, Query, Response
 
 Tell = Callable[[str], None]
 """How a person is told something while a stage goes on."""
@@ -225,7 +225,7 @@ def report_card(
         return grade(subject, rng)
 
 
-def _fits(model: Path) -> list[dict[str, Any]]:
+def _fits(model: Path) -> list[Json]:
     """What the fits of a run, or the one of a saved reward model, came to."""
     alone = model / "fit.json"
     return [json.loads(alone.read_text())] if alone.exists() else read_metrics(model)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic
+from typing import Generic
 
 import sqlalchemy as sql
 
@@ -23,7 +23,7 @@ from prefrl.storage.log import EventLog, StoreError, Transaction, row
 from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, bodies, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
-from prefrl.types import C, Candidate, Floats, Query
+from prefrl.types import C, Candidate, Floats, Json, Query
 
 WRITERS = 16
 """Files written at once."""
@@ -67,7 +67,7 @@ class Store(Generic[C]):
         self._check_kind(candidates.values())
         # Files before events: what the log names must be there, and a file that it does not name does no harm.
         self._file(candidates.values())
-        more: list[dict[str, Any]] = [{} for _ in queries]
+        more: list[Json] = [{} for _ in queries]
         if purpose != "label":
             more = [{"purpose": purpose, "expected": best} for _, best in zip(queries, expected, strict=True)]
         with self.log.transaction() as tx:
@@ -82,7 +82,7 @@ class Store(Generic[C]):
         with self.log.transaction() as tx:
             self.put_all(tx, answers)
 
-    def put_all(self, tx: Transaction, answers: Sequence[Answer], about: dict[str, Any] | None = None) -> list[int]:
+    def put_all(self, tx: Transaction, answers: Sequence[Answer], about: Json | None = None) -> list[int]:
         """Add answers in a transaction; returns their numbers. `about` is kept with each: how it came about."""
         sizes = _sizes(tx, {answer.query for answer in answers})
         there = words(tx.connection, [(answer.query, answer.labeler) for answer in answers])
@@ -97,7 +97,7 @@ class Store(Generic[C]):
             rows.append(row(id, answer_kind(answer), answer.query, answer.labeler, body))
         return tx.extend(rows)
 
-    def put(self, tx: Transaction, answer: Answer, about: dict[str, Any]) -> int:
+    def put(self, tx: Transaction, answer: Answer, about: Json) -> int:
         """Add one answer in a transaction; returns its number."""
         return self.put_all(tx, [answer], about)[0]
 
@@ -106,7 +106,7 @@ class Store(Generic[C]):
         with self.log.transaction() as tx:
             self.take_back(tx, query, labeler)
 
-    def take_back(self, tx: Transaction, query: str, labeler: str, about: dict[str, Any] | None = None) -> int:
+    def take_back(self, tx: Transaction, query: str, labeler: str, about: Json | None = None) -> int:
         """Take a labeler's answer back in a transaction; returns the retraction's number."""
         word = words(tx.connection, [(query, labeler)]).get((query, labeler))
         if word is None or word["kind"] == "retracted":
@@ -114,7 +114,7 @@ class Store(Generic[C]):
         id = f"{query}:{labeler}:{word['revision']}:retract"
         return tx.append(row(id, "retract", query, labeler, {"about": about} if about else {}))
 
-    def merge(self, events: Callable[[], Iterable[dict[str, Any]]], blobs: Path) -> Merged:
+    def merge(self, events: Callable[[], Iterable[Json]], blobs: Path) -> Merged:
         """Add the events of another store, arrays from its `blobs` folder; returns how many answers are new.
 
         All or none, and few in memory at a time: each is checked before anything is written, so `events` is called
@@ -128,7 +128,7 @@ class Store(Generic[C]):
                 tx.extend(some)
         return merged
 
-    def _copy(self, blobs: Path, one: dict[str, Any]) -> None:
+    def _copy(self, blobs: Path, one: Json) -> None:
         self._file_one(load_candidate(one["id"], one["body"], blobs))
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
@@ -192,7 +192,7 @@ class Store(Generic[C]):
             for one in connection.execute(sql.select(event).where(known, ~replaced, trains).order_by(event.c.seq)):
                 yield read_answer(one.kind, one.subject, one.actor, one.body)
 
-    def events(self) -> Iterator[dict[str, Any]]:
+    def events(self) -> Iterator[Json]:
         """The whole log, oldest first: what a lossless copy needs, beside the blobs."""
         return self.log.since(0)
 
@@ -220,7 +220,7 @@ class Store(Generic[C]):
         for id, body in self._bodies(new, "candidate").items():
             self._loaded[id] = load_candidate(id, body, self.folder / "blobs")
 
-    def _bodies(self, ids: Sequence[str], kind: str) -> dict[str, Any]:
+    def _bodies(self, ids: Sequence[str], kind: str) -> Json:
         """What was said of queries or candidates when they were asked."""
         with self.log.reading() as connection:
             found = bodies(connection, ids)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
@@ -19,6 +20,10 @@ Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Integers: TypeAlias = npt.NDArray[np.integer[Any]]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 Metrics: TypeAlias = dict[str, float]
+Json: TypeAlias = dict[str, Any]
+"""An object of JSON: a row of a file, the body of an event, a summary."""
+Fields: TypeAlias = Mapping[str, Any]
+"""The same, to be read only."""
 State: TypeAlias = dict[str, Any]
 """Nested dicts and lists of arrays, tensors, numbers, strings and None: what a checkpoint can hold."""
 LARGEST = 2**31 - 1

@@ -21,7 +21,7 @@ from prefrl.evaluate.card import ReportCard
 from prefrl.kinds import find, named
 from prefrl.loop import Loop
 from prefrl.report import card_words
-from prefrl.types import Round
+from prefrl.types import Fields, Round
 
 if TYPE_CHECKING:
     from prefrl.rundir import Run
@@ -154,7 +154,7 @@ def round_line(round: Round[Any]) -> Text:
     return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
 
 
-def summary_table(summary: Mapping[str, Any]) -> Table:
+def summary_table(summary: Fields) -> Table:
     """`summary.json` for people."""
     title = Text(f"{summary['task']} ({summary['kind']}), seed {summary['seed']}")
     table = Table(title=title, show_header=False, box=None)

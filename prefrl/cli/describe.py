@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any
 
 from rich.console import RenderableType
 from rich.markup import escape
@@ -17,6 +16,7 @@ from prefrl.components import TABLE, ConfigError, Role, Settings, kinds, suggest
 from prefrl.config import Config, presets
 from prefrl.fit.settings import FittingSettings
 from prefrl.loop import LoopSettings
+from prefrl.types import Json
 
 ALWAYS: dict[str, type[Settings]] = {"fitting": FittingSettings, "loop": LoopSettings}
 WORDS = {"integer": "int", "number": "float", "boolean": "bool", "string": "str", "object": "mapping", "null": "null"}
@@ -39,13 +39,13 @@ def explain(name: str | None) -> list[RenderableType]:
     return [part for role in roles for part in _component(f"{role[:-1]} kind {name}", described(role, name))]
 
 
-def _component(title: str, described: dict[str, Any]) -> list[RenderableType]:
+def _component(title: str, described: Json) -> list[RenderableType]:
     intro = Text(described.get("description", ""))
     shown = table(title, ("setting", "type", "default", "meaning"), list(_rows(described, described.get("$defs", {}))))
     return [intro, Text(), shown, *_formula(described.get("x-formula", ""))]
 
 
-def _rows(described: dict[str, Any], groups: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+def _rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
     """A row for each setting; those of a group are told one by one, as `group.name`."""
     for name, setting in described["properties"].items():
         if "$ref" in setting:
@@ -67,7 +67,7 @@ def _formula(formula: str) -> list[RenderableType]:
     return [Text("\nwhat it optimises", style="bold"), Padding(escape(formula), (0, 2))] if formula else []
 
 
-def _type(setting: dict[str, Any], between: str = " ") -> str:
+def _type(setting: Json, between: str = " ") -> str:
     """The type in words, with its bounds; or the values that it may have."""
     if "$ref" in setting:
         return _name(setting)
@@ -83,12 +83,12 @@ def _type(setting: dict[str, Any], between: str = " ") -> str:
     return between.join([word, *(f"{sign} {setting[bound]:g}" for bound, sign in SIGNS.items() if bound in setting)])
 
 
-def _name(reference: dict[str, Any]) -> str:
+def _name(reference: Json) -> str:
     """Of the settings class that is referred to."""
     return str(reference["$ref"]).rpartition("/")[2]
 
 
-def _default(setting: dict[str, Any], required: bool) -> str:
+def _default(setting: Json, required: bool) -> str:
     """As YAML writes it."""
     if "default" not in setting:
         return "required" if required else "..."

@@ -8,6 +8,7 @@ from typing import Any
 
 from prefrl.components import TABLE, Role, Settings, plugins, settings_class
 from prefrl.config import Config
+from prefrl.types import Json
 
 ROLES: dict[str, Role] = {
     "task": "tasks",
@@ -19,9 +20,9 @@ ROLES: dict[str, Role] = {
 REQUIRED = ["task", "reward", "learner"]
 
 
-def schema() -> dict[str, Any]:
+def schema() -> Json:
     """Every key of a config with its type and meaning; for a component, the settings of each built-in kind."""
-    definitions: dict[str, Any] = {}
+    definitions: Json = {}
     properties = {name: _group(name, field.annotation, definitions) for name, field in Config.model_fields.items()}
     for name, field in Config.model_fields.items():
         properties[name]["description"] = field.description
@@ -36,7 +37,7 @@ def schema() -> dict[str, Any]:
     }
 
 
-def schema_of(cls: type[Settings]) -> dict[str, Any]:
+def schema_of(cls: type[Settings]) -> Json:
     """The schema of a settings class; with its defaults, a learner says what it optimises."""
     made = cls.model_json_schema(ref_template="#/$defs/{model}")
     if not made.get("required") and (formula := cls().formula()):
@@ -44,7 +45,7 @@ def schema_of(cls: type[Settings]) -> dict[str, Any]:
     return made
 
 
-def described(role: Role, kind: str) -> dict[str, Any]:
+def described(role: Role, kind: str) -> Json:
     """The schema of one kind's settings, with its `$defs`.
 
     For a built-in kind it is taken from the file that is shipped: nothing is imported that the kind itself needs.
@@ -56,7 +57,7 @@ def described(role: Role, kind: str) -> dict[str, Any]:
     return {**shipped["$defs"][name], "$defs": shipped["$defs"]}
 
 
-def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+def _group(name: str, annotation: Any, definitions: Json) -> Json:
     """The schema of one top-level key."""
     if name in ROLES:
         role = ROLES[name]
@@ -67,7 +68,7 @@ def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str,
     return {"type": "integer"}  # the seed
 
 
-def _define(cls: type[Settings], definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
+def _define(cls: type[Settings], definitions: Json, kind: str | None) -> Json:
     """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
     made = schema_of(cls)
     definitions |= made.pop("$defs", {})

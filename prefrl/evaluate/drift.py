@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,13 +13,13 @@ from prefrl.evaluate.card import Drift
 from prefrl.judgements import Judged
 from prefrl.stats.estimates import Estimate, undefined
 from prefrl.stats.intervals import correlate
-from prefrl.types import C
+from prefrl.types import C, Json
 
 PROBES = 64
 """How many of the first judged candidates are scored after each fit."""
 
 
-def read_probes(folder: Path) -> list[dict[str, Any]]:
+def read_probes(folder: Path) -> list[Json]:
     """The rows of `probes.jsonl`, one a fitted round; the first one names the candidates."""
     path = folder / "probes.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
@@ -31,7 +30,7 @@ def first_judged(judged: Sequence[Judged[C]]) -> list[str]:
     return list(dict.fromkeys(c.id for one in judged for c in one.query.candidates))[:PROBES]
 
 
-def drift(rows: Sequence[dict[str, Any]]) -> list[Drift]:
+def drift(rows: Sequence[Json]) -> list[Drift]:
     """From each row `{"round": ..., "scores": [...]}` to the next."""
     return [_step(a["scores"], b["scores"], b["round"]) for a, b in pairwise(rows)]
 

@@ -28,7 +28,7 @@ from prefrl.protocols import Judgements, RewardModel
 from prefrl.stats.estimates import Estimate, undefined
 from prefrl.stats.intervals import clusters, correlation
 from prefrl.storage.files import DamagedError
-from prefrl.types import Candidate, Floats, Integers, Query, gold_score
+from prefrl.types import Candidate, Fields, Floats, Integers, Json, Query, gold_score
 
 DRAWN = 300
 """Candidates in a scatter plot."""
@@ -70,7 +70,7 @@ class Subject:
     data: str = ""
     held_out: bool = False
     round: int | None = None
-    probes: Sequence[dict[str, Any]] = ()
+    probes: Sequence[Json] = ()
     """Rows of `probes.jsonl`."""
     habits: Habits = field(default_factory=Habits)
 
@@ -167,9 +167,9 @@ def _candidates(judged: Sequence[Judged[Any]]) -> list[Candidate]:
     return list({c.id: c for one in judged for c in one.query.candidates}.values())
 
 
-def habits(fitting: FittingSettings, rows: Sequence[Mapping[str, Any]]) -> Habits:
+def habits(fitting: FittingSettings, rows: Sequence[Fields]) -> Habits:
     """As the newest fit in the rows of `metrics.jsonl` found them."""
-    found: Mapping[str, Any] = next((row for row in reversed(rows) if row.get("fit/loss") is not None), {})
+    found: Fields = next((row for row in reversed(rows) if row.get("fit/loss") is not None), {})
     mark = "fit/error_rate/"
     rates = {k.removeprefix(mark): v for k, v in found.items() if k.startswith(mark) and v is not None}
     return Habits(fitting, found.get("fit/tie"), rates)

@@ -6,21 +6,21 @@ import json
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from prefrl.protocols import Task
+from prefrl.types import Json
 
 PACKAGES = ("prefrl", "torch", "numpy", "transformers", "gymnasium", "mujoco", "stable-baselines3")
 STAGES = ("sample", "label", "fit", "improve", "evaluate")
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
+def read_metrics(folder: Path) -> list[Json]:
     """The rows of `metrics.jsonl`, one a round."""
     path = folder / "metrics.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def summarise(rows: list[dict[str, Any]], task: Task, seed: int) -> dict[str, Any]:
+def summarise(rows: list[Json], task: Task, seed: int) -> Json:
     """One flat account of a run from its metrics; None where something was not measured."""
     first, last = (rows[0], rows[-1]) if rows else ({}, {})
     gold = [row["evaluate/gold"] for row in rows if row.get("evaluate/gold") is not None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,6 +15,7 @@ from prefrl.storage.events import PORTABLE
 from prefrl.storage.files import MANIFEST, DamagedError, whole_folder, write_file
 from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
+from prefrl.types import Fields, Json
 
 EVENTS = "events.jsonl"
 BLOBS = "blobs"
@@ -46,7 +47,7 @@ def export_bundle(store: Store[Any], path: Path) -> Exported:
     return Exported(answers, {"event about people's access or the project's settings": left} if left else {}, (note,))
 
 
-def _event_text(one: Mapping[str, Any]) -> str:
+def _event_text(one: Fields) -> str:
     body = json.loads(json.dumps(one["body"], sort_keys=True))  # sorted at every depth: the same store, the same bytes
     return json_text({name: body if name == "body" else one[name] for name in FIELDS})
 
@@ -96,7 +97,7 @@ def _sha256(path: Path) -> str:
         raise DamagedError(f"{path} cannot be read, though {MANIFEST} names it: {error}") from error
 
 
-def _events(path: Path) -> Iterator[dict[str, Any]]:
+def _events(path: Path) -> Iterator[Json]:
     for number, line in enumerate(read_lines(path), 1):
         try:
             one = parse_json(line)

@@ -6,7 +6,8 @@ The column `guarded` names the columns of a row that got one, so that nobody els
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+
+from prefrl.types import Fields, Json
 
 STARTS = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the start of a formula (OWASP, CSV injection)."""
@@ -20,7 +21,7 @@ def guarded(row: Mapping[str, str], columns: Iterable[str]) -> dict[str, str]:
     return {name: GUARD + cell if name in risky else cell for name, cell in row.items()} | {GUARDED: " ".join(risky)}
 
 
-def unguarded(row: Mapping[str, Any]) -> dict[str, Any]:
+def unguarded(row: Fields) -> Json:
     """The row as it was before `guarded`; other rows as they are. Raises `ValueError` where an apostrophe is gone."""
     named = (row.get(GUARDED) or "").split()
     for name in named:

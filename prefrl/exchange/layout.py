@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, person
 from prefrl.storage.events import check_answer
-from prefrl.types import Query, Response, is_whole
+from prefrl.types import Fields, Json, Query, Response, is_whole
 
 
 class Row(NamedTuple):
@@ -81,7 +81,7 @@ VERDICTS = ("ranks", "best", "ratings", "preference", "skip")
 """Columns of which one says the answer."""
 
 
-def answer_of(row: Mapping[str, Any], candidates: Sequence[Any]) -> Row:
+def answer_of(row: Fields, candidates: Sequence[Any]) -> Row:
     """The answer that a row gives to the candidates that it lists. Raises `ValueError` unless it gives just one."""
     given = [name for name in VERDICTS if row.get(name) is not None]
     if len(given) != 1:
@@ -89,7 +89,7 @@ def answer_of(row: Mapping[str, Any], candidates: Sequence[Any]) -> Row:
     return answered(row, candidates, partial(_GIVEN[given[0]], row))
 
 
-def answered(row: Mapping[str, Any], candidates: Sequence[Any], verdict: Callable[..., Answer]) -> Row:
+def answered(row: Fields, candidates: Sequence[Any], verdict: Callable[..., Answer]) -> Row:
     """A query over candidates, and an answer in the query's own order.
 
     `verdict` is given `order`, where `order[i]` is where candidate i stands in the query.
@@ -113,7 +113,7 @@ def responses(prompt: str, texts: Sequence[str]) -> list[Response]:
     return [Response(prompt, text) for text in texts]
 
 
-def _shown(row: Mapping[str, Any], order: Sequence[int]) -> tuple[int, ...]:
+def _shown(row: Fields, order: Sequence[int]) -> tuple[int, ...]:
     """Which candidate stood in each place, where the row says it of its own responses."""
     shown = row.get("shown")
     if not shown:
@@ -123,11 +123,11 @@ def _shown(row: Mapping[str, Any], order: Sequence[int]) -> tuple[int, ...]:
     return tuple(order[i] for i in shown)
 
 
-def comparison(first_better: float, query: str, order: Sequence[int], who: dict[str, Any]) -> Comparison:
+def comparison(first_better: float, query: str, order: Sequence[int], who: Json) -> Comparison:
     return Comparison(query, first_better if order[0] == 0 else 1.0 - first_better, **who)
 
 
-def _preference(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Comparison:
+def _preference(row: Fields, query: str, order: Sequence[int], who: Json) -> Comparison:
     value = row["preference"]
     if len(order) != 2 or isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"a preference is a number, of the first of two responses; got {value!r} for {len(order)}")
@@ -136,24 +136,24 @@ def _preference(row: Mapping[str, Any], query: str, order: Sequence[int], who: d
     return comparison(float(value), query, order, who)
 
 
-def _ranking(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Ranking:
+def _ranking(row: Fields, query: str, order: Sequence[int], who: Json) -> Ranking:
     return Ranking(query, _integers(row["ranks"], "ranks", order), **who)
 
 
-def _choice(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Choice:
+def _choice(row: Fields, query: str, order: Sequence[int], who: Json) -> Choice:
     best = row["best"]
     if isinstance(best, bool) or not isinstance(best, int) or not 0 <= best < len(order):
         raise ValueError(f"best: expected the number of a response, from 0 to {len(order) - 1}, got {best!r}")
     return Choice(query, order[best], **who)
 
 
-def _skip(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Skip:
+def _skip(row: Fields, query: str, order: Sequence[int], who: Json) -> Skip:
     if row["skip"] not in ("skip", "incomparable"):
         raise ValueError(f"skip: expected skip or incomparable, got {row['skip']!r:.200}")
     return Skip(query, row["skip"], who["labeler"], who["shown"])
 
 
-def _rating(row: Mapping[str, Any], query: str, order: Sequence[int], who: dict[str, Any]) -> Rating:
+def _rating(row: Fields, query: str, order: Sequence[int], who: Json) -> Rating:
     scale = row.get("scale")
     if isinstance(scale, bool) or not isinstance(scale, int):
         raise ValueError(f'ratings need "scale", how many levels there are; got {scale!r}')
@@ -178,7 +178,7 @@ def _integers(values: Any, name: str, order: Sequence[int]) -> tuple[int, ...]:
     return tuple(by_place[i] for i in range(len(order)))
 
 
-def optional(row: Mapping[str, Any], name: str, kind: Any, default: Any) -> Any:
+def optional(row: Fields, name: str, kind: Any, default: Any) -> Any:
     """A value that may be left out; a table has None there."""
     value = row.get(name)
     if value is None:
@@ -188,7 +188,7 @@ def optional(row: Mapping[str, Any], name: str, kind: Any, default: Any) -> Any:
     return value
 
 
-def number(row: Mapping[str, Any], name: str, default: float) -> float:
+def number(row: Fields, name: str, default: float) -> float:
     """A number that may be left out. Raises `ValueError` where it is not finite: a table may hold NaN."""
     try:
         value = float(optional(row, name, (int, float), default))

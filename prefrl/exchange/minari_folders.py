@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from prefrl.exchange.layout import Parts, Row, answer_of
 from prefrl.exchange.reading import parse_json, read_lines, refuse_links
-from prefrl.types import Segment
+from prefrl.types import Fields, Segment
 
 LABELS = "labels.jsonl"
 
@@ -65,7 +65,7 @@ class _Episodes:
         return self.found[number]
 
 
-def _segment(data: Mapping[str, Any], options: Mapping[str, Any]) -> Segment:
+def _segment(data: Fields, options: Fields) -> Segment:
     observations, actions = (np.asarray(data[name], np.float32) for name in ("observations", "actions"))
     if not np.isfinite(observations).all() or not np.isfinite(actions).all():
         raise ValueError(f"episode {data['id']} holds values that are not finite")

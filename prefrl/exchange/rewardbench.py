@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prefrl.storage.files import write_file
+from prefrl.types import Json
 
 
 class ScoredPair(NamedTuple):
@@ -50,5 +51,5 @@ def _columns(rows: Sequence[ScoredPair]) -> dict[str, list[Any]]:
     return {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _write_json(path: Path, content: Json) -> None:
     write_file(path, json.dumps(content, indent=4, sort_keys=True).encode())

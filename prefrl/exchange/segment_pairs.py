@@ -12,13 +12,12 @@ import zlib
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from prefrl.exchange.layout import Parts, Row
 from prefrl.judgements import Comparison
-from prefrl.types import Query, Segment
+from prefrl.types import Fields, Query, Segment
 
 ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
 
@@ -41,7 +40,7 @@ def segment_pairs(path: Path) -> Parts:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _arrays(file: Mapping[str, Any], split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _arrays(file: Fields, split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """The segments of a part, and its labels by labeler."""
     if missing := [f"{split}_{name}" for name in ARRAYS if f"{split}_{name}" not in file]:
         raise ValueError(f"array {missing[0]} is missing")

@@ -19,7 +19,7 @@ from prefrl.protocols import Judgements
 from prefrl.storage.files import DamagedError
 from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
-from prefrl.types import Floats, Query
+from prefrl.types import Floats, Json, Query
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
     return Opened(store, ())
 
 
-def _events(store: Store[Any], which: Which) -> Iterator[dict[str, Any]]:
+def _events(store: Store[Any], which: Which) -> Iterator[Json]:
     """What was asked, and what those have said of it who are wanted."""
     for one in store.events():
         said = one["kind"] in (*ANSWERS, "retract") and which.takes(one["actor"])

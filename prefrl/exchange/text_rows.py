@@ -43,6 +43,7 @@ from prefrl.exchange.transcripts import (
     split_conversations,
 )
 from prefrl.judgements import Rating
+from prefrl.types import Fields, Json
 
 COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "label", "responses", *VERDICTS, "scale")
 _NO_TEXT = ("margin", "label", "responses", *VERDICTS, "scale", "weight", "shown")
@@ -75,7 +76,7 @@ def parse(row: Any, layout: Layout | None = None, cells: bool = False) -> list[R
     return FORMS[form_of(row) if layout.form == "auto" else layout.form](row)
 
 
-def form_of(row: Mapping[str, Any]) -> str:
+def form_of(row: Fields) -> str:
     """Which form a row has, by its columns; "preferences" where nothing else is meant."""
     if isinstance(row.get("fields"), Mapping):
         return "argilla"
@@ -90,7 +91,7 @@ def form_of(row: Mapping[str, Any]) -> str:
     return "unpaired" if "completion" in row and "chosen" not in row else "preferences"
 
 
-def _mapped(row: dict[str, Any], columns: Mapping[str, str]) -> dict[str, Any]:
+def _mapped(row: Json, columns: Mapping[str, str]) -> Json:
     """The row under our names, with what was named alone; a tool's row keeps its other parts."""
     if not columns:
         return row
@@ -116,14 +117,14 @@ def _typed(name: str, cell: str | None) -> Any:
 # --- chosen and rejected -----------------------------------------------------------------------------------------
 
 
-def _pair(row: Mapping[str, Any]) -> list[Row | str]:
+def _pair(row: Fields) -> list[Row | str]:
     prompt, chosen, rejected = _conversational(row) or _implicit(row) or _plain(row)
     if chosen == rejected:
         raise ValueError("chosen and rejected are the same text")
     return [answered(row, responses(prompt, [chosen, rejected]), partial(comparison, _strength(row)))]
 
 
-def _plain(row: Mapping[str, Any]) -> tuple[str, str, str]:
+def _plain(row: Fields) -> tuple[str, str, str]:
     for name in ("prompt", "chosen", "rejected"):
         if name not in row:
             raise ValueError(f"column {name!r} is missing; there are: {', '.join(map(str, row))}")
@@ -132,7 +133,7 @@ def _plain(row: Mapping[str, Any]) -> tuple[str, str, str]:
     return row["prompt"], row["chosen"], row["rejected"]
 
 
-def _conversational(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
+def _conversational(row: Fields) -> tuple[str, str, str] | None:
     """Chosen and rejected as lists of messages: responses, or whole conversations that start alike."""
     if not isinstance(row.get("chosen"), list) or not isinstance(row.get("rejected"), list):
         return None
@@ -142,7 +143,7 @@ def _conversational(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
     return _prompt(row["prompt"]), response_text(chosen), response_text(rejected)
 
 
-def _implicit(row: Mapping[str, Any]) -> tuple[str, str, str] | None:
+def _implicit(row: Fields) -> tuple[str, str, str] | None:
     """Chosen and rejected as transcripts that start alike."""
     if row.get("prompt") is not None or not (
         isinstance(row.get("chosen"), str) and isinstance(row.get("rejected"), str)
@@ -158,7 +159,7 @@ def _prompt(value: Any) -> str:
     return prompt_text(read_messages(value)) if isinstance(value, list) else str(value)
 
 
-def _strength(row: Mapping[str, Any]) -> float:
+def _strength(row: Fields) -> float:
     """How probably the chosen one is better: as said, or by its margin in the Bradley-Terry model, else surely."""
     preference, margin = number(row, "preference", 1.0), number(row, "margin", 0.0)
     if not 0.0 <= preference <= 1.0:
@@ -170,7 +171,7 @@ def _strength(row: Mapping[str, Any]) -> float:
     return round(1.0 / (1.0 + math.exp(-margin)), 12)
 
 
-def _unpaired(row: Mapping[str, Any]) -> list[Row | str]:
+def _unpaired(row: Fields) -> list[Row | str]:
     """One response that is good or not: a rating on a scale of two levels."""
     label, completion = row.get("label"), row.get("completion")
     if label not in (0, 1) or not isinstance(label, bool | int):
@@ -182,14 +183,14 @@ def _unpaired(row: Mapping[str, Any]) -> list[Row | str]:
     return [answered(row, responses(_prompt(row["prompt"]), [completion]), partial(_good, int(label)))]
 
 
-def _good(level: int, query: str, order: Sequence[int], who: dict[str, Any]) -> Rating:
+def _good(level: int, query: str, order: Sequence[int], who: Json) -> Rating:
     return Rating(query, (level,), 2, **who)
 
 
 # --- several responses ------------------------------------------------------------------------------------------
 
 
-def _several(row: Mapping[str, Any]) -> Row:
+def _several(row: Fields) -> Row:
     texts = row.get("responses")
     if not isinstance(row.get("prompt"), str) or not isinstance(texts, list):
         raise ValueError(f'expected "prompt": string and "responses": list, got {row!r:.200}')
@@ -201,7 +202,7 @@ def _several(row: Mapping[str, Any]) -> Row:
 # --- conversation trees ------------------------------------------------------------------------------------------
 
 
-def _trees(row: Mapping[str, Any]) -> list[Row | str]:
+def _trees(row: Fields) -> list[Row | str]:
     return _tree(row.get("prompt"), optional(row, "split", str, ""))
 
 
@@ -228,7 +229,7 @@ def _is_message(value: Any) -> bool:
     return known and isinstance(value.get("replies") or [], list)
 
 
-def _group(prompt: str, replies: Sequence[Mapping[str, Any]], split: str) -> list[Row | str]:
+def _group(prompt: str, replies: Sequence[Fields], split: str) -> list[Row | str]:
     ranked = [reply for reply in replies if reply.get("rank") is not None]
     if len(ranked) < 2:
         return ["prompt with fewer than two ranked replies"]
@@ -239,17 +240,17 @@ def _group(prompt: str, replies: Sequence[Mapping[str, Any]], split: str) -> lis
     ]
 
 
-def _responses(row: Mapping[str, Any]) -> list[Row | str]:
+def _responses(row: Fields) -> list[Row | str]:
     return [_several(row)]
 
 
-def _of_tool(name: str, row: Mapping[str, Any]) -> list[Row | str]:
+def _of_tool(name: str, row: Fields) -> list[Row | str]:
     from prefrl.exchange.tool_rows import TOOLS
 
     return TOOLS[name](row)
 
 
-FORMS: Mapping[str, Callable[[Mapping[str, Any]], list[Row | str]]] = {
+FORMS: Mapping[str, Callable[[Fields], list[Row | str]]] = {
     "preferences": _pair,
     "unpaired": _unpaired,
     "responses": _responses,

@@ -9,6 +9,7 @@ from typing import Any
 
 from prefrl.exchange.layout import Row, answer_of, optional, responses
 from prefrl.exchange.transcripts import read_messages, split_conversations
+from prefrl.types import Fields
 
 PROMPTS = ("prompt", "instruction", "question", "input")
 """Names under which a tool's records hold what was asked."""
@@ -17,7 +18,7 @@ PAIRS = (("left", "right"), ("text1", "text2"), ("answer1", "answer2"), ("respon
 TIES = ("tie", "equal", "same")
 _USERS = uuid.uuid5(uuid.NAMESPACE_URL, "prefrl:labeler")
 """Argilla's users go by a UUID: that of a labeler's name under this one."""
-TOOLS: Mapping[str, Callable[[Mapping[str, Any]], list[Row | str]]]
+TOOLS: Mapping[str, Callable[[Fields], list[Row | str]]]
 
 
 def _row(verdict: str, value: Any, prompt: str, texts: Sequence[str], labeler: str) -> Row:
@@ -29,7 +30,7 @@ def _written_from(found: Sequence[Row | str], query: Any) -> list[Row | str]:
     return [one._replace(named=query) if isinstance(one, Row) and isinstance(query, str) else one for one in found]
 
 
-def _object(row: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _object(row: Fields, name: str) -> Fields:
     if not isinstance(found := row.get(name), Mapping):
         raise ValueError(f"column {name!r}: expected an object, got {found!r:.200}")
     return found
@@ -38,7 +39,7 @@ def _object(row: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 # --- Argilla ------------------------------------------------------------------------------------------------------
 
 
-def _argilla(record: Mapping[str, Any]) -> list[Row | str]:
+def _argilla(record: Fields) -> list[Row | str]:
     """A record {"fields", "responses": {question: [{"value", "user_id", "status"}]}} of Argilla 2, one row a response.
 
     The responses to compare are the fields that a question's answers name, or all fields but the prompt. An answer is
@@ -67,7 +68,7 @@ def _labelers(metadata: Any) -> dict[str, str]:
     return {user_id(""): ""} | {user_id(name): name for name in names or () if isinstance(name, str)}
 
 
-def _fields(fields: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
+def _fields(fields: Fields) -> tuple[str, dict[str, str]]:
     """The prompt, and the texts by the names of their fields, in the order of the numbers in these."""
     known = next((name for name in PROMPTS if name in fields), None)
     if not isinstance(prompt := fields.get(known or "", ""), str):
@@ -129,7 +130,7 @@ def _named(value: Any, names: Sequence[str]) -> int | None:
 # --- Label Studio -------------------------------------------------------------------------------------------------
 
 
-def _label_studio(task: Mapping[str, Any]) -> list[Row | str]:
+def _label_studio(task: Fields) -> list[Row | str]:
     """A task {"data", "annotations"} with pairwise results, one row an annotation; a choice may be a tie.
 
     An annotation that was cancelled is a skip.
@@ -145,7 +146,7 @@ def _label_studio(task: Mapping[str, Any]) -> list[Row | str]:
     ]
 
 
-def _task(data: Mapping[str, Any]) -> tuple[str, list[str]]:
+def _task(data: Fields) -> tuple[str, list[str]]:
     pair = next((pair for pair in PAIRS if pair[0] in data and pair[1] in data), None)
     if pair is None:
         tried = ", ".join("/".join(pair) for pair in PAIRS)
@@ -180,7 +181,7 @@ def _annotation(one: Any, prompt: str, texts: Sequence[str]) -> Row | str:
     return "annotation without a choice of left or right"
 
 
-def _choices(value: Mapping[str, Any]) -> list[str]:
+def _choices(value: Fields) -> list[str]:
     several = value.get("choices")
     found = [value.get("selected"), *(several if isinstance(several, list) else [])]
     return [one.lower() for one in found if isinstance(one, str)]
@@ -189,7 +190,7 @@ def _choices(value: Mapping[str, Any]) -> list[str]:
 # --- the arena ----------------------------------------------------------------------------------------------------
 
 
-def _arena(battle: Mapping[str, Any]) -> list[Row | str]:
+def _arena(battle: Fields) -> list[Row | str]:
     """{"conversation_a", "conversation_b", "winner"} and perhaps the "judge"; both bad is incomparable."""
     a, b = (read_messages(battle.get(f"conversation_{side}")) for side in "ab")
     prompt, *texts = split_conversations(a, b)

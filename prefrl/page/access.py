@@ -8,18 +8,19 @@ import secrets
 import threading
 import uuid
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
 from prefrl.storage import tables
 from prefrl.storage.log import row
+from prefrl.types import Json
 
 Role: TypeAlias = Literal["annotator", "admin", "trainer"]
 State: TypeAlias = Literal["active", "paused", "revoked"]
 Use: TypeAlias = Literal["invite", "session"]
-Event: TypeAlias = dict[str, Any]
+Event: TypeAlias = Json
 NAME = 80
 """Characters of a name at most."""
 

@@ -22,6 +22,7 @@ from prefrl.page.people import admin, errors, service_of
 from prefrl.page.security import Refused
 from prefrl.page.service import Service
 from prefrl.store import Store
+from prefrl.types import Json
 
 Admin = Annotated[Person, Depends(admin)]
 Served = Annotated[Service, Depends(service_of)]
@@ -73,7 +74,7 @@ def _add_people(router: APIRouter) -> None:
             return await _invite(served, request, name, found.role)
         if verb == "revoke" and name == who.name:
             raise Refused(409, "you cannot revoke yourself: nobody could go on")
-        states: dict[str, Any] = {"pause": "paused", "resume": "active", "revoke": "revoked"}
+        states: Json = {"pause": "paused", "resume": "active", "revoke": "revoked"}
         try:
             await served.record(served.access.change(name, states[verb]))
         except ValueError as error:

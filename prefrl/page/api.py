@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from prefrl.stats.estimates import Estimate
+from prefrl.types import Json
 
 Id: TypeAlias = Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
 """A client-made or server-made 128-bit id."""
@@ -219,7 +220,7 @@ class Receipt(Plain):
 
 class Undone(Plain):
     assignment: Assignment
-    answer: dict[str, Any]
+    answer: Json
     """The answer that was taken back, as it was sent: outcome, strength, ranking, comment, flags."""
 
 
@@ -227,7 +228,7 @@ class Entry(Plain):
     """One of a person's last answers."""
 
     assignment: Assignment
-    answer: dict[str, Any]
+    answer: Json
     at: str
     """UTC, ISO 8601."""
 

@@ -22,6 +22,7 @@ from prefrl.page.service import Service
 from prefrl.page.trainer import trainer_routes
 from prefrl.page.writer import Unavailable
 from prefrl.storage.log import StoreError, StoreFull
+from prefrl.types import Json
 
 CLIP_SECONDS = 20.0
 """How long a clip that is not drawn yet is waited for, before the page is told to ask again."""
@@ -259,7 +260,7 @@ def _failure(status: int, error: str, retry: float | None = None) -> JSONRespons
     return JSONResponse({"error": error}, status, headers)
 
 
-def _mistake(one: dict[str, Any]) -> str:
+def _mistake(one: Json) -> str:
     """What is wrong with a body, without repeating it."""
     where = ".".join(str(part)[:40] for part in one["loc"] if part != "body")
     return f"{where}: {one['msg']}" if where else str(one["msg"])

@@ -7,12 +7,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from prefrl.kinds import Shown, logged
 from prefrl.page import api, records
 from prefrl.page.questions import Given
 from prefrl.storage.log import EventLog
+from prefrl.types import Json
 
 REMEMBERED = 1000
 """Queries whose candidates are kept in memory."""
@@ -23,7 +24,7 @@ def whole(text: str) -> str:
     return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
-def _shown(candidate: dict[str, Any]) -> Shown:
+def _shown(candidate: Json) -> Shown:
     return logged(candidate["type"]).shown(candidate)
 
 
@@ -48,7 +49,7 @@ class Cards:
 
     def __init__(self, events: EventLog, kind: str, fps: float, lease: float, clips: ClipSource | None) -> None:
         self._log, self._kind, self._fps, self._lease, self._clips = events, kind, fps, lease, clips
-        self._known: OrderedDict[str, list[dict[str, Any]]] = OrderedDict()
+        self._known: OrderedDict[str, list[Json]] = OrderedDict()
         self._lock = threading.Lock()
 
     def show(self, given: Sequence[Given]) -> list[api.Assignment]:
@@ -61,7 +62,7 @@ class Cards:
                     self._clips.want(candidate["id"], soon=number == 0)
         return cards
 
-    def _card(self, given: Given, candidates: list[dict[str, Any]]) -> api.Assignment:
+    def _card(self, given: Given, candidates: list[Json]) -> api.Assignment:
         shown = [candidates[i] for i in given.shown]
         prompt = _shown(shown[0]).prompt
         return api.Assignment(
@@ -74,14 +75,14 @@ class Cards:
             lease_seconds=self._lease,
         )
 
-    def _item(self, slot: int, candidate: dict[str, Any]) -> api.Item:
+    def _item(self, slot: int, candidate: Json) -> api.Item:
         shown = _shown(candidate)
         if shown.text is not None:
             return api.Item(slot=slot, text=whole(shown.text))
         media = self._clips.names(candidate["id"]) if self._clips is not None else []
         return api.Item(slot=slot, media=media, steps=shown.steps, fps=self._fps)
 
-    def _candidates(self, queries: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    def _candidates(self, queries: Sequence[str]) -> dict[str, list[Json]]:
         with self._lock:
             found = {id: self._known[id] for id in queries if id in self._known}
         new = [id for id in queries if id not in found]

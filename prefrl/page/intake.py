@@ -23,6 +23,7 @@ from prefrl.storage.events import answer_body, answer_kind
 from prefrl.storage.log import Transaction, row
 from prefrl.storage.tables import assignment, canonical, submission
 from prefrl.store import Store
+from prefrl.types import Json
 
 REMEMBERED = 10_000
 """Submissions that changed nothing."""
@@ -47,7 +48,7 @@ class Reopened:
     """An answer that was taken back."""
 
     given: Given
-    answer: dict[str, Any]
+    answer: Json
     """As it was sent."""
     question: Question | None = None
     """Its query as it is now; None where the answer had been taken back before."""
@@ -147,13 +148,13 @@ class Intake:
             raise Refused(409, "this question was given to somebody else")
         return found
 
-    def _about(self, sent: api.Answer, given: Given, digest: str) -> dict[str, Any]:
+    def _about(self, sent: api.Answer, given: Given, digest: str) -> Json:
         """How an answer came about, kept beside it."""
         kept = sent.model_dump(exclude={"submission_id", "assignment_id"})
         ids = {"submission": sent.submission_id, "digest": digest, "assignment": given.id}
         return kept | ids | {"guideline": sent.guideline or given.guideline}
 
-    def _file_repeat(self, tx: Transaction, given: Given, answer: Answer, about: dict[str, Any], again: bool) -> int:
+    def _file_repeat(self, tx: Transaction, given: Given, answer: Answer, about: Json, again: bool) -> int:
         """An answer that nothing is learned from; the first one stays where it was."""
         id = f"repeat:{given.id}" + (f":{about['submission']}" if again else "")
         body = {"answer": {"kind": answer_kind(answer), **answer_body(answer)}, "about": about}

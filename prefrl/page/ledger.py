@@ -7,16 +7,15 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
 from prefrl.judgements import Answer, best_of, implied_pairs
 from prefrl.storage.events import ANSWER_TYPES, read_answer
-from prefrl.types import Floats
+from prefrl.types import Fields, Floats
 
 JUDGED, SKIPPED, INCOMPARABLE = 0, 1, 2
 LABEL, CHECK, REPEAT = 0, 1, 2
@@ -78,16 +77,16 @@ class Ledger:
         """The columns of the pairs that they imply."""
         return {name: np.array(column) for name, column in self._pairs.items()}
 
-    def read(self, event: Mapping[str, Any]) -> None:
+    def read(self, event: Fields) -> None:
         """The next event of the log; kinds that say nothing of answers are passed over."""
         reader = _READERS.get(event["kind"])
         if reader is not None:
             reader(self, event)
 
-    def _candidate(self, event: Mapping[str, Any]) -> None:
+    def _candidate(self, event: Fields) -> None:
         self._steps[event["id"]] = event["body"].get("steps", 0)
 
-    def _query(self, event: Mapping[str, Any]) -> None:
+    def _query(self, event: Fields) -> None:
         body = event["body"]
         steps = max(self._steps.get(id, 0) for id in body["candidates"])
         numbers = (self._candidates.setdefault(id, len(self._candidates)) for id in body["candidates"])
@@ -98,13 +97,13 @@ class Ledger:
             clip=steps / self.fps if self.fps and steps else np.nan,
         )
 
-    def _answer(self, event: Mapping[str, Any]) -> None:
+    def _answer(self, event: Fields) -> None:
         answer = read_answer(event["kind"], event["subject"], event["actor"], event["body"])
         at = self._add(event, answer, event["body"].get("about"), repeat=False)
         if at is not None:
             self.standing[at[1:]] = at[0]
 
-    def _repeat(self, event: Mapping[str, Any]) -> None:
+    def _repeat(self, event: Fields) -> None:
         body = event["body"]
         said = {name: value for name, value in body["answer"].items() if name != "kind"}
         answer = read_answer(body["answer"]["kind"], event["subject"], event["actor"], said)
@@ -112,18 +111,16 @@ class Ledger:
         if at is not None:
             self.repeats.append(at)
 
-    def _retract(self, event: Mapping[str, Any]) -> None:
+    def _retract(self, event: Fields) -> None:
         asked = self.queries.get(event["subject"])
         if asked is not None:
             self.standing.pop((asked.number, self.people.get(event["actor"], -1)), None)
 
-    def _flag(self, event: Mapping[str, Any]) -> None:
+    def _flag(self, event: Fields) -> None:
         text = str(event["body"].get("text", ""))
         self.flags.appendleft({"at": event["at"], "actor": event["actor"], "query": event["subject"], "text": text})
 
-    def _add(
-        self, event: Mapping[str, Any], answer: Answer, about: Mapping[str, Any] | None, repeat: bool
-    ) -> tuple[int, int, int] | None:
+    def _add(self, event: Fields, answer: Answer, about: Fields | None, repeat: bool) -> tuple[int, int, int] | None:
         """A row for an answer: (row, query, person); None where its query is not known."""
         asked = self.queries.get(answer.query)
         if asked is None:
@@ -156,7 +153,7 @@ class Ledger:
                 column.append(value)
 
 
-_READERS: dict[str, Callable[[Ledger, Mapping[str, Any]], None]] = {
+_READERS: dict[str, Callable[[Ledger, Fields], None]] = {
     **dict.fromkeys(ANSWER_TYPES, Ledger._answer),
     "candidate": Ledger._candidate,
     "query": Ledger._query,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Request
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
@@ -11,6 +11,7 @@ from prefrl.page import api
 from prefrl.page.access import Person
 from prefrl.page.security import Refused
 from prefrl.page.service import Service
+from prefrl.types import Json
 
 ALWAYS = (400, 403, 408, 429, 500, 503)
 """What any request may be answered with: the guard says it, or the disk."""
@@ -18,7 +19,7 @@ _cookie = APIKeyCookie(name="prefrl-STORE", description="STORE is `store` of /ap
 _bearer = HTTPBearer(auto_error=False)
 
 
-def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def errors(*statuses: int) -> dict[int | str, Json]:
     """The failures that a route declares, beside those that any may meet."""
     return {status: {"model": api.Failure} for status in sorted({*statuses, *ALWAYS})}
 

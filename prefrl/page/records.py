@@ -15,6 +15,7 @@ from prefrl.page.desk import REMEMBERED
 from prefrl.page.questions import BETWEEN, Given, Past, Question
 from prefrl.storage.projection import ANSWERS, JUDGEMENTS, RETRACTED, bodies
 from prefrl.storage.tables import assignment, event, query, setting, standing
+from prefrl.types import Json
 
 done = query.c.judged + query.c.incomparable
 # Statements for each answer are built once: building one costs more than running it.
@@ -123,7 +124,7 @@ def past(connection: Connection, annotator: str) -> Past:
     return Past(total, answered, [_given(row) for row in reversed(recent)], set(connection.scalars(repeats)))
 
 
-def last_answers(connection: Connection, annotator: str) -> list[tuple[Given, dict[str, Any], str]]:
+def last_answers(connection: Connection, annotator: str) -> list[tuple[Given, Json, str]]:
     """A person's last answers, newest first: what was given, how it was answered, and when."""
     mine = (assignment.c.annotator == annotator) & assignment.c.answered.is_not(None)
     joined = sql.select(assignment, event.c.body, event.c.at).join(event, event.c.seq == assignment.c.answered)
@@ -131,7 +132,7 @@ def last_answers(connection: Connection, annotator: str) -> list[tuple[Given, di
     return [(_given(row), as_sent(row.body), row.at) for row in rows]
 
 
-def last_answer(connection: Connection, one: Given) -> dict[str, Any]:
+def last_answer(connection: Connection, one: Given) -> Json:
     """How an assignment was answered last, whether that stands or was taken back; {} where it never was."""
     spoke = (event.c.subject == one.query) & (event.c.actor == one.annotator)
     kinds = ("repeat",) if one.purpose == "repeat" else ANSWERS
@@ -140,20 +141,20 @@ def last_answer(connection: Connection, one: Given) -> dict[str, Any]:
     return {} if body is None else as_sent(body)
 
 
-def as_sent(body: dict[str, Any]) -> dict[str, Any]:
+def as_sent(body: Json) -> Json:
     """An answer as the page sent it, in the order of the slots."""
     about = body.get("about") or {}
     return {name: about.get(name) for name in ("outcome", "strength", "ranking", "comment", "flags")}
 
 
-def candidates(connection: Connection, queries: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+def candidates(connection: Connection, queries: Sequence[str]) -> dict[str, list[Json]]:
     """Of each query its candidates as the log describes them, each with its `id`."""
     asked = {id: body["candidates"] for id, body in bodies(connection, queries).items()}
     described = bodies(connection, [c for ids in asked.values() for c in ids])
     return {id: [described[c] | {"id": c} for c in ids] for id, ids in asked.items()}
 
 
-def settings(connection: Connection) -> dict[str, Any]:
+def settings(connection: Connection) -> Json:
     """What was changed while people labelled."""
     return {row.key: json.loads(row.value) for row in connection.execute(sql.select(setting))}
 
@@ -182,7 +183,7 @@ def queries_after(connection: Connection, seq: int, limit: int) -> list[tuple[in
     return [(row.seq, row.id) for row in connection.execute(some)]
 
 
-def judgements_after(connection: Connection, seq: int, limit: int) -> list[dict[str, Any]]:
+def judgements_after(connection: Connection, seq: int, limit: int) -> list[Json]:
     """Answers and retractions after an event, oldest first, for a trainer in another process; checks not among them."""
     columns = [event.c[name] for name in ("seq", "kind", "subject", "actor", "body", "at")]
     trains = sql.exists().where(query.c.id == event.c.subject, query.c.purpose == "label")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Condition, Lock
@@ -34,7 +34,7 @@ from prefrl.page.texts import (
 from prefrl.page.writer import Unavailable, Writer
 from prefrl.storage.log import Transaction, row
 from prefrl.store import Store
-from prefrl.types import Query
+from prefrl.types import Fields, Query
 
 if TYPE_CHECKING:
     from prefrl.page.figures import Dashboard
@@ -221,7 +221,7 @@ class Service:
             return "read-only"
         return self.writer.trouble or ("ok" if self.writer.alive else "nothing can be stored: the writer has ended")
 
-    def _take_up(self, kept: Mapping[str, Any]) -> None:
+    def _take_up(self, kept: Fields) -> None:
         """The texts and settings that hold: those that were made on the page before those that this was started with.
 
         What is agreed to can be changed by the settings alone.

@@ -7,6 +7,8 @@ import math
 import re
 from typing import Any, NoReturn
 
+from prefrl.types import Json
+
 DEPTH = 16
 """Lists and objects inside one another."""
 DIGITS = 20
@@ -68,7 +70,7 @@ def _int(text: str) -> int:
     return int(text)
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object(pairs: list[tuple[str, Any]]) -> Json:
     found = dict(pairs)
     if len(found) < len(pairs):
         raise NotStrict("a key is given twice")

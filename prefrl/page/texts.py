@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import uuid
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from prefrl.page.access import Event
 from prefrl.storage.log import row
+from prefrl.types import Fields
 
 TEXT = "consent"
 AGREED = "consent:"
@@ -38,7 +37,7 @@ class Consent:
         return "" if self.agreed.get(name) == self.version else self.version
 
 
-def agreements(kept: Mapping[str, Any]) -> dict[str, str]:
+def agreements(kept: Fields) -> dict[str, str]:
     """Name -> version, of a store's settings."""
     return {key.removeprefix(AGREED): version for key, version in kept.items() if key.startswith(AGREED)}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 from pydantic import Field
@@ -16,6 +16,7 @@ from prefrl.page.people import errors, service_of, trainer
 from prefrl.page.security import Refused
 from prefrl.page.service import Service
 from prefrl.storage.tables import canonical
+from prefrl.types import Json
 
 MOST_LABELS, MOST_QUERIES = 10_000, 1000
 """In one answer."""
@@ -85,10 +86,10 @@ def trainer_routes() -> APIRouter:
     @router.get("/api/labels", responses=errors(401))
     async def labels(
         who: Trainer, served: Served, after_seq: After = 0, limit: Annotated[int, Query(ge=1, le=MOST_LABELS)] = 1000
-    ) -> dict[str, list[dict[str, Any]]]:
+    ) -> dict[str, list[Json]]:
         """Answers and retractions after an event's number, oldest first."""
 
-        def read() -> list[dict[str, Any]]:
+        def read() -> list[Json]:
             with served.store.log.reading() as connection:
                 return records.judgements_after(connection, after_seq, limit)
 
@@ -111,5 +112,5 @@ def _asked(served: Service, after: int, limit: int) -> AskedQueries:
     return AskedQueries(queries=[Asked(seq=seq, id=id, candidates=_told(candidates[id])) for seq, id in found])
 
 
-def _told(candidates: list[dict[str, Any]]) -> list[Candidate]:
+def _told(candidates: list[Json]) -> list[Candidate]:
     return [Candidate(id=one["id"], prompt=one.get("prompt"), text=one.get("text")) for one in candidates]

@@ -15,7 +15,7 @@ from PIL import Image
 from prefrl.kinds import kind_of
 from prefrl.protocols import DrawnTask, Task
 from prefrl.storage.files import write_file
-from prefrl.types import Candidate, Floats, gold_score
+from prefrl.types import Candidate, Floats, Json, gold_score
 
 FRAMES = 6
 GAP, GREY = 2, 215
@@ -51,7 +51,7 @@ def strip(frames: np.ndarray, count: int = FRAMES) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def _show(task: Task, candidate: Candidate, place: Path, file: str) -> dict[str, Any]:
+def _show(task: Task, candidate: Candidate, place: Path, file: str) -> Json:
     kind = kind_of(candidate)
     shown = kind.shown(kind.describe(candidate))
     if shown.text is not None:

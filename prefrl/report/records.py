@@ -19,8 +19,9 @@ from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import Bin, reliability
 from prefrl.evaluate.card import ReportCard
+from prefrl.types import Json
 
-Json: TypeAlias = dict[str, Any]
+Json: TypeAlias = Json
 MAX_TEXT = 4_000
 MAX_CONFIG = 50_000
 MAX_PICTURE = 4_000_000

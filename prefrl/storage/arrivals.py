@@ -7,7 +7,7 @@ be looked through.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,13 +27,13 @@ from prefrl.storage.events import (
 )
 from prefrl.storage.projection import ANSWERS, CHUNK, chunks
 from prefrl.storage.tables import event
-from prefrl.types import Query
+from prefrl.types import Fields, Query
 
 SHOWN = 20
 """How many contradictions are told."""
 WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
 """What comes of an event that is not as events are."""
-Event = Mapping[str, Any]
+Event = Fields
 
 
 class Merged(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from prefrl.kinds import kind_of, logged
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.engines import StoreError
 from prefrl.storage.projection import ANSWERS
-from prefrl.types import LARGEST, Candidate, is_whole
+from prefrl.types import LARGEST, Candidate, Fields, Json, is_whole
 
 ANSWER_TYPES: dict[str, type[Answer]] = dict(zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Skip), strict=True))
 PORTABLE = ("candidate", "query", *ANSWERS, "retract", "assign", "repeat", "guideline", "flag")
@@ -36,7 +36,7 @@ _IDS = {
 """What ids look like that are not made of what they name: none may stand in the place of an answer's."""
 
 
-def describe(candidate: Candidate) -> dict[str, Any]:
+def describe(candidate: Candidate) -> Json:
     """A candidate without its arrays and its gold."""
     kind = kind_of(candidate)
     return {"type": kind.noun, **kind.describe(candidate)}
@@ -48,7 +48,7 @@ def write_candidate(candidate: Candidate, blobs: Path) -> None:
         write_arrays(blobs, candidate.id, arrays)
 
 
-def load_candidate(id: str, body: dict[str, Any], blobs: Path) -> Any:
+def load_candidate(id: str, body: Json, blobs: Path) -> Any:
     """A candidate from its description, and its arrays if it has any; its content must have the id it goes by."""
     loaded = logged(body["type"]).load(body, lambda: read_arrays(blobs, id))
     if loaded.id != id:
@@ -61,14 +61,14 @@ def answer_kind(answer: Answer) -> str:
     return next(kind for kind, cls in ANSWER_TYPES.items() if isinstance(answer, cls))
 
 
-def answer_body(answer: Answer) -> dict[str, Any]:
+def answer_body(answer: Answer) -> Json:
     """What the event that holds an answer says beside its query and its labeler."""
     return {name: value for name, value in asdict(answer).items() if name not in ("query", "labeler")}
 
 
-def read_answer(kind: str, query: str, labeler: str, body: dict[str, Any]) -> Answer:
+def read_answer(kind: str, query: str, labeler: str, body: Json) -> Answer:
     """The answer that an event holds; JSON has lists where answers have tuples."""
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in body.items() if k != "about"}
+    values: Json = {k: tuple(v) if isinstance(v, list) else v for k, v in body.items() if k != "about"}
     return ANSWER_TYPES[kind](query=query, labeler=labeler, **values)
 
 
@@ -115,7 +115,7 @@ def _is_order(shown: Any, size: int) -> bool:
     return isinstance(shown, Sequence) and all(map(is_whole, shown)) and sorted(shown) == list(range(size))
 
 
-def check_event(one: Mapping[str, Any]) -> None:
+def check_event(one: Fields) -> None:
     """Check what an event from elsewhere says by itself, whatever came before it.
 
     Raises `ValueError`, `KeyError`, `TypeError` or `AttributeError` for one that cannot be believed.
@@ -163,7 +163,7 @@ def _check_about(about: Any) -> None:
         raise StoreError(f"about.timings.decision_ms: expected a number from 0 on, got {decision!r:.40}")
 
 
-def check_assignment(body: Mapping[str, Any], size: int) -> None:
+def check_assignment(body: Fields, size: int) -> None:
     """What was put to somebody of a query of `size` candidates. Raises `StoreError`."""
     if body["purpose"] not in ("label", "check", "repeat") or not isinstance(body.get("guideline", ""), str):
         raise StoreError(f"an assignment has a purpose and a guideline, got {body!r:.200}")
@@ -171,7 +171,7 @@ def check_assignment(body: Mapping[str, Any], size: int) -> None:
         raise StoreError(f"an assignment shows each of {size} candidates once, got {body['shown']!r:.200}")
 
 
-def check_purpose(body: Mapping[str, Any], size: int) -> None:
+def check_purpose(body: Fields, size: int) -> None:
     """What a query of `size` candidates was asked for. Raises `StoreError`."""
     purpose, expected = body.get("purpose", "label"), body.get("expected")
     if purpose not in ("label", "check") or not is_whole(body.get("batch", 0), LARGEST):
@@ -180,7 +180,7 @@ def check_purpose(body: Mapping[str, Any], size: int) -> None:
         raise StoreError(f"a query is a check, and names its best candidate, or neither, got {body!r:.200}")
 
 
-def load_foreign(id: str, body: dict[str, Any], blobs: Path) -> Candidate:
+def load_foreign(id: str, body: Json, blobs: Path) -> Candidate:
     """`load_candidate` for one from elsewhere. Raises `StoreError` where a part of it is not of its kind."""
     loaded: Candidate = load_candidate(id, body, blobs)
     if body != describe(loaded):

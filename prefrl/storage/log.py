@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sql
 from sqlalchemy import Connection
@@ -20,6 +19,7 @@ from prefrl.storage.engines import StoreError
 from prefrl.storage.files import write_file
 from prefrl.storage.projection import CHUNK, all_events, chunks, project
 from prefrl.storage.tables import SCHEMA, chained, event, meta, metadata, version
+from prefrl.types import Json
 
 BALLAST = 8 * 2**20
 """Bytes kept in reserve while people label: a full disk still has room to close the books."""
@@ -35,7 +35,7 @@ class DamagedStore(StoreError):
     """The log is not what was written."""
 
 
-def row(id: str, kind: str, subject: str = "", actor: str = "", body: dict[str, Any] | None = None) -> dict[str, Any]:
+def row(id: str, kind: str, subject: str = "", actor: str = "", body: Json | None = None) -> Json:
     """One event: `id` makes it idempotent, `subject` is the query it speaks of, `actor` who speaks."""
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     return {"id": id, "kind": kind, "subject": subject, "actor": actor, "body": body or {}, "at": now}
@@ -49,11 +49,11 @@ class Transaction:
     seq: int
     hash: str
 
-    def append(self, one: dict[str, Any]) -> int:
+    def append(self, one: Json) -> int:
         """Append an event; returns its number. One whose id is there already changes nothing."""
         return self.extend([one])[0]
 
-    def extend(self, rows: Iterable[dict[str, Any]]) -> list[int]:
+    def extend(self, rows: Iterable[Json]) -> list[int]:
         """Append events; returns the number of each. Those whose ids are there already change nothing."""
         rows = list(rows)
         numbers = self._numbers([one["id"] for one in rows])
@@ -162,7 +162,7 @@ class EventLog:
                 says = "nothing more can be stored until there is room; what was acknowledged is safe"
                 raise StoreFull(f"the disk with {self.folder} is full: {says}") from error
 
-    def append(self, rows: Iterable[dict[str, Any]]) -> None:
+    def append(self, rows: Iterable[Json]) -> None:
         """Add the events whose id is new, in one transaction that is on disk when this returns."""
         with self.transaction() as at:
             at.extend(rows)
@@ -202,7 +202,7 @@ class EventLog:
         with self._reader.connect() as connection:
             yield connection
 
-    def since(self, seq: int) -> Iterator[dict[str, Any]]:
+    def since(self, seq: int) -> Iterator[Json]:
         """The events after a number, oldest first, with their numbers and hashes."""
         with self.reading() as connection:
             yield from all_events(connection, seq)

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sql
 from sqlalchemy import Connection
@@ -20,6 +19,7 @@ from prefrl.storage.files import check_free, verify, whole_folder, write_file
 from prefrl.storage.log import StoreError, check_schema, require_store
 from prefrl.storage.projection import KINDS, all_events, chunks, dump, project, rebuild
 from prefrl.storage.tables import SCHEMA, chained, event, meta, metadata, version
+from prefrl.types import Json
 
 SHOWN = 20
 """How many faults are told."""
@@ -149,7 +149,7 @@ def _check_chain(connection: Connection, found: Verified) -> None:
         found.faults.append(f"the log ends at event {found.whole}, but it was noted to end at {noted:.24}")
 
 
-def _chain(connection: Connection, found: Verified) -> Iterator[dict[str, Any]]:
+def _chain(connection: Connection, found: Verified) -> Iterator[Json]:
     """The events whose hashes are right, up to the first that is wrong; `found` says how it went."""
     # Bodies as the text that was hashed: parsed and written again, damage could go unnoticed.
     before, raw = "", sql.type_coerce(event.c.body, sql.Text).label("raw")
@@ -158,7 +158,7 @@ def _chain(connection: Connection, found: Verified) -> Iterator[dict[str, Any]]:
         some = sql.select(event, raw).where(event.c.seq > after).order_by(event.c.seq).limit(5000)
         rows = list(connection.execute(some.with_only_columns(*(c for c in event.c if c.name != "body"), raw)))
         for row in rows:
-            one: dict[str, Any] = dict(row._mapping)
+            one: Json = dict(row._mapping)
             one["body"] = one.pop("raw")
             after, found.events = one["seq"], found.events + 1
             if one["seq"] != found.whole + 1 or chained(before, one) != one["hash"] or one["kind"] not in KINDS:
@@ -198,14 +198,14 @@ def _check_blobs(connection: Connection, folder: Path, found: Verified) -> None:
             found.blobs += 1
 
 
-def _until_unreadable(rows: Iterator[dict[str, Any]], found: Verified) -> Iterator[dict[str, Any]]:
+def _until_unreadable(rows: Iterator[Json], found: Verified) -> Iterator[Json]:
     try:
         yield from rows
     except (DatabaseError, ValueError, KeyError, TypeError) as error:
         found.faults.append(f"event {found.whole + 1}: {error}")
 
 
-def _write_events(rows: Iterator[dict[str, Any]], folder: Path) -> None:
+def _write_events(rows: Iterator[Json], folder: Path) -> None:
     """A new database with these events, hashes and all, and its derived tables."""
     engine = sql.create_engine(f"sqlite:///{folder / 'store.db'}")
     last = (0, "")

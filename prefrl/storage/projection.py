@@ -5,7 +5,7 @@ The same function follows the log as it grows and writes the tables again from i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -25,13 +25,14 @@ from prefrl.storage.tables import (
     submission,
     token,
 )
+from prefrl.types import Fields, Json
 
 JUDGEMENTS = ("comparison", "ranking", "choice", "rating")
 ANSWERS = (*JUDGEMENTS, "skip")
 RETRACTED = "retracted"
 CHUNK = 400
 """Keys in one statement: databases limit the number of parameters."""
-Event = Mapping[str, Any]
+Event = Fields
 # Statements are built once: building one costs more than running it.
 _WORD = sql.select(standing).where(
     standing.c.query == sql.bindparam("b_query"), standing.c.labeler == sql.bindparam("b_labeler")
@@ -84,7 +85,7 @@ def dump(connection: Connection) -> Iterator[str]:
             yield canonical([table.name, *row])
 
 
-def all_events(connection: Connection, after: int = 0) -> Iterator[dict[str, Any]]:
+def all_events(connection: Connection, after: int = 0) -> Iterator[Json]:
     """The events after a number, oldest first, a few thousand in memory at a time."""
     while True:
         # By number: an offset would count through all the rows before it, each time.
@@ -108,18 +109,18 @@ def chunks(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
         yield some
 
 
-def bodies(connection: Connection, ids: Iterable[str]) -> dict[str, dict[str, Any]]:
+def bodies(connection: Connection, ids: Iterable[str]) -> dict[str, Json]:
     """What was said of queries and candidates when they were asked, by id; those that nobody asked are missing."""
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, Json] = {}
     for some in chunks(dict.fromkeys(ids), CHUNK):
         chosen = event.c.id.in_(some) & event.c.kind.in_(("query", "candidate"))
         found |= {one.id: one.body for one in connection.execute(sql.select(event.c.id, event.c.body).where(chosen))}
     return found
 
 
-def words(connection: Connection, keys: Iterable[tuple[str, str]]) -> dict[tuple[str, str], dict[str, Any]]:
+def words(connection: Connection, keys: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Json]:
     """(query, labeler) -> the newest word there, for those that have said any."""
-    found: dict[tuple[str, str], dict[str, Any]] = {}
+    found: dict[tuple[str, str], Json] = {}
     for some in chunks(dict.fromkeys(keys), CHUNK):
         if len(some) == 1:
             rows = connection.execute(_WORD, {"b_query": some[0][0], "b_labeler": some[0][1]})
@@ -130,7 +131,7 @@ def words(connection: Connection, keys: Iterable[tuple[str, str]]) -> dict[tuple
     return found
 
 
-def _asked(one: Event) -> dict[str, Any]:
+def _asked(one: Event) -> Json:
     body = one["body"]
     return {
         "id": one["id"],
@@ -150,7 +151,7 @@ def _answer(connection: Connection, events: Sequence[Event]) -> None:
     if not events:
         return
     there = words(connection, ((one["subject"], one["actor"]) for one in events))
-    counts: dict[str, dict[str, Any]] = {}
+    counts: dict[str, Json] = {}
     for one in events:
         key = one["subject"], one["actor"]
         old = there.get(key)
@@ -242,7 +243,7 @@ KINDS = ("candidate", "query", *ANSWERS, "retract", *_OTHERS)
 """Every kind of event."""
 
 
-def _upsert(connection: Connection, table: sql.Table, rows: list[dict[str, Any]]) -> None:
+def _upsert(connection: Connection, table: sql.Table, rows: list[Json]) -> None:
     """Insert rows, or replace those of the same key."""
     connection.execute(_upsertion(connection.dialect.name, table), rows)
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sql
 
+from prefrl.types import Json
+
 SCHEMA = 2
 metadata = sql.MetaData()
 
@@ -142,7 +144,7 @@ for statement in (
     sql.event.listen(event, "after_create", sql.DDL(statement).execute_if(dialect="postgresql"))  # type: ignore[no-untyped-call]
 
 
-def chained(before: str, row: dict[str, Any]) -> str:
+def chained(before: str, row: Json) -> str:
     """The hash of an event: sha256 over the hash before it and all that it says. "" is before the first."""
     fields = [row[name] for name in ("seq", "id", "kind", "subject", "actor", "at")]
     body = row["body"] if isinstance(row["body"], str) else canonical(row["body"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from prefrl.storage.log import StoreError
 from prefrl.storage.projection import chunks
 from prefrl.storage.tables import event
 from prefrl.store import Store
+from prefrl.types import Fields, Json
 
 PAIRS = "preferences"
 FILE = "train-00000-of-00001.parquet"
@@ -57,7 +58,7 @@ def export_dataset(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, f"{pairs} pairs for training and {written} judgements", note)
 
 
-def _pairs(store: Store[Any], margins: bool) -> Iterator[dict[str, Any]]:
+def _pairs(store: Store[Any], margins: bool) -> Iterator[Json]:
     for pair in each_pair(store, Tally(), "dataset"):
         if pair.preference > 0.5:
             row = {"prompt": pair.chosen.prompt, "chosen": pair.chosen.text, "rejected": pair.rejected.text}
@@ -80,7 +81,7 @@ def _judgement_columns() -> Any:
     return pa.schema([*first, *verdicts, ("labeler", text), ("weight", pa.float64()), ("shown", wholes), ("at", text)])
 
 
-def _write(path: Path, rows: Iterable[Mapping[str, Any]], columns: Any) -> int:
+def _write(path: Path, rows: Iterable[Fields], columns: Any) -> int:
     """Write rows as Parquet, some at a time; returns how many."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -24,7 +24,7 @@ from prefrl.storage.projection import ANSWERS, CHUNK, all_events, bodies, chunks
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
 from prefrl.store import Store
-from prefrl.types import Query, Response
+from prefrl.types import Fields, Json, Query, Response
 
 LABELER = "annotator's name"
 ORDER = "order in which candidates were shown"
@@ -54,7 +54,7 @@ class Given(NamedTuple):
     at: str
     answer: Answer
     query: Query[Any]
-    about: Mapping[str, Any]
+    about: Fields
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def knows_strengths(store: Store[Any]) -> bool:
         return any(is_soft(read_answer(e["kind"], e["subject"], e["actor"], e["body"])) for e in found)
 
 
-def _standing(connection: sql.Connection) -> Iterator[list[dict[str, Any]]]:
+def _standing(connection: sql.Connection) -> Iterator[list[Json]]:
     """The events of answers that stand, some at a time."""
     for some in chunks((e for e in all_events(connection) if e["kind"] in ANSWERS), CHUNK):
         newest = words(connection, [(e["subject"], e["actor"]) for e in some])
@@ -168,7 +168,7 @@ class Tally:
         return Exported(written, {name: count for name, count in self.dropped.items() if count}, notes)
 
 
-def told(given: Given) -> dict[str, Any]:
+def told(given: Given) -> Json:
     """The answer, and by whom, when and how it was given, as columns of a row."""
     answer = given.answer
     weight = {"weight": answer.weight} if answer.reason is None else {}
@@ -206,7 +206,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
     sync_folder(path.parent)
 
 
-def write_lines(path: Path, rows: Iterator[Mapping[str, Any]]) -> int:
+def write_lines(path: Path, rows: Iterator[Fields]) -> int:
     """Write one JSON object a line; returns how many."""
     count = 0
     with whole_file(path) as file:
@@ -216,7 +216,7 @@ def write_lines(path: Path, rows: Iterator[Mapping[str, Any]]) -> int:
     return count
 
 
-def write_list(path: Path, rows: Iterator[Mapping[str, Any]]) -> int:
+def write_list(path: Path, rows: Iterator[Fields]) -> int:
     """Write one JSON list, an element a line; returns how many."""
     count = 0
     with whole_file(path) as file:

@@ -26,7 +26,7 @@ from prefrl.kinds import only
 from prefrl.storage.files import whole_folder
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Segment
+from prefrl.types import Json, Segment
 
 LABELS = "labels.jsonl"
 STATES = "simulator states of a segment"
@@ -102,7 +102,7 @@ def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
     episodes[segment.id] = len(episodes)
 
 
-def _labels(store: Store[Any], tally: Tally, episodes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+def _labels(store: Store[Any], tally: Tally, episodes: Mapping[str, int]) -> Iterator[Json]:
     for given in each_answer(store):
         tally.note(given)
         compared = {"query": given.query.id, "episodes": [episodes[c.id] for c in given.query.candidates]}

@@ -28,7 +28,7 @@ from prefrl.exchange.exports.given import (
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
 from prefrl.judgements import good, implied_pairs
 from prefrl.store import Store
-from prefrl.types import Response
+from prefrl.types import Json, Response
 
 BOTH = "tie written both ways"
 MIDDLE = "response that is neither better than all others nor worse"
@@ -100,9 +100,7 @@ def export_preferences(store: Store[Any], path: Path, ties: str = "drop", conver
     return tally.done(store, written, *say.notes())
 
 
-def _preferences(
-    pairs: Iterator[Pair], tally: Tally, ties: str, margins: bool, say: Conversations
-) -> Iterator[dict[str, Any]]:
+def _preferences(pairs: Iterator[Pair], tally: Tally, ties: str, margins: bool, say: Conversations) -> Iterator[Json]:
     for pair in pairs:
         tie = pair.preference == 0.5
         if tie:
@@ -129,7 +127,7 @@ def export_unpaired(store: Store[Any], path: Path, conversational: bool = False)
     return tally.done(store, write_lines(path, _unpaired(store, tally, say)), *say.notes())
 
 
-def _unpaired(store: Store[Any], tally: Tally, say: Conversations) -> Iterator[dict[str, Any]]:
+def _unpaired(store: Store[Any], tally: Tally, say: Conversations) -> Iterator[Json]:
     for given in each_answer(store):
         refuse_segments(given, "unpaired")
         tally.note(given)
@@ -153,7 +151,7 @@ def export_judgements(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, write_lines(path, each_judgement(store, tally)))
 
 
-def each_judgement(store: Store[Any], tally: Tally) -> Iterator[dict[str, Any]]:
+def each_judgement(store: Store[Any], tally: Tally) -> Iterator[Json]:
     """Every answer as a row of its prompt, its responses in the query's order, and the answer."""
     for given in each_answer(store):
         refuse_segments(given, "judgements")

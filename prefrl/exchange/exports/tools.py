@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from itertools import chain
 from pathlib import Path
@@ -26,7 +26,7 @@ from prefrl.exchange.tool_rows import user_id
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Skip, implied_pairs
 from prefrl.store import Store
-from prefrl.types import Response
+from prefrl.types import Fields, Json, Response
 
 SOME_RATING = "rating, for which records hold no question"
 
@@ -55,10 +55,10 @@ def export_argilla(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written)
 
 
-def _record(group: Sequence[Given], tally: Tally) -> list[dict[str, Any]]:
+def _record(group: Sequence[Given], tally: Tally) -> list[Json]:
     texts = group[0].query.candidates
     names = [f"response_{i + 1}" for i in range(len(texts))]
-    responses: dict[str, list[dict[str, Any]]] = {}
+    responses: dict[str, list[Json]] = {}
     for given in group:
         if (answer := _argilla_answer(given.answer, names)) is None:
             tally.dropped[SOME_RATING] += 1
@@ -104,9 +104,9 @@ def export_label_studio(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, write_list(path, chain.from_iterable(_tasks(group, tally) for group in groups)))
 
 
-def _tasks(group: Sequence[Given], tally: Tally) -> list[dict[str, Any]]:
+def _tasks(group: Sequence[Given], tally: Tally) -> list[Json]:
     """A task for each pair of a query's responses that was judged."""
-    texts, pairs = group[0].query.candidates, dict[tuple[int, int], list[dict[str, Any]]]()
+    texts, pairs = group[0].query.candidates, dict[tuple[int, int], list[Json]]()
     for given in group:
         if given.answer.reason is not None and len(texts) != 2:
             tally.skip(given.answer.reason)
@@ -122,12 +122,12 @@ def _tasks(group: Sequence[Given], tally: Tally) -> list[dict[str, Any]]:
     return [_task(id, texts[i], texts[j], annotations) for (i, j), annotations in pairs.items()]
 
 
-def _task(query: str, left: Response, right: Response, annotations: list[dict[str, Any]]) -> dict[str, Any]:
+def _task(query: str, left: Response, right: Response, annotations: list[Json]) -> Json:
     data = {"prompt": left.prompt, "left": left.text, "right": right.text}
     return {"data": data, "meta": {"query": query}, "annotations": annotations}
 
 
-def _results(answer: Answer, size: int) -> list[tuple[int, int, list[dict[str, Any]], bool]]:
+def _results(answer: Answer, size: int) -> list[tuple[int, int, list[Json], bool]]:
     """(left, right, result, whether it was cancelled) for each pair that an answer speaks of."""
     if answer.reason is not None:
         outcome = [] if answer.reason == "skip" else [_choice("incomparable")]
@@ -139,15 +139,15 @@ def _results(answer: Answer, size: int) -> list[tuple[int, int, list[dict[str, A
     return found
 
 
-def _pairwise(side: str) -> dict[str, Any]:
+def _pairwise(side: str) -> Json:
     return {"from_name": "pairwise", "to_name": "left,right", "type": "pairwise", "value": {"selected": side}}
 
 
-def _choice(outcome: str) -> dict[str, Any]:
+def _choice(outcome: str) -> Json:
     return {"from_name": "outcome", "to_name": "left", "type": "choices", "value": {"choices": [outcome]}}
 
 
-def _swapped(result: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _swapped(result: list[Json]) -> list[Json]:
     side = {"left": "right", "right": "left"}
     return [_pairwise(side[r["value"]["selected"]]) if r["type"] == "pairwise" else r for r in result]
 
@@ -166,7 +166,7 @@ def export_arena(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, *notes, *([f"{len(untold)} x {UNTOLD}"] if untold else []))
 
 
-def _battles(store: Store[Any], tally: Tally, untold: set[str]) -> Iterator[dict[str, Any]]:
+def _battles(store: Store[Any], tally: Tally, untold: set[str]) -> Iterator[Json]:
     for given in each_answer(store):
         refuse_segments(given, "arena")
         tally.note(given)
@@ -183,13 +183,13 @@ def _battles(store: Store[Any], tally: Tally, untold: set[str]) -> Iterator[dict
             yield _battle(given, (texts[i], texts[j]), winner, untold)
 
 
-def _battle(given: Given, pair: Sequence[Response], winner: str, untold: set[str]) -> dict[str, Any]:
+def _battle(given: Given, pair: Sequence[Response], winner: str, untold: set[str]) -> Json:
     asked: Messages | None = prompt_messages(pair[0].prompt)
     if asked is None:
         untold.add(pair[0].prompt)
         asked = [{"role": "user", "content": pair[0].prompt}]
     a, b = ([*asked, *response_messages(one.text)] for one in pair)
-    models: Mapping[str, Any] = {"question_id": given.query.id, "model_a": "unknown", "model_b": "unknown"}
+    models: Fields = {"question_id": given.query.id, "model_a": "unknown", "model_b": "unknown"}
     said = {"winner": winner, "judge": given.answer.labeler, "conversation_a": a, "conversation_b": b}
     turns = sum(message["role"] == "user" for message in a)
     return {**models, **said, "turn": turns, "tstamp": datetime.fromisoformat(given.at).timestamp()}

@@ -15,7 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
-from typing import IO, Any
+from typing import IO
+
+from prefrl.types import Json
 
 log = logging.getLogger(__name__)
 PATIENCE = 3.0
@@ -123,7 +125,7 @@ class Drawer:
                 self._child = _start(self._command)
             return self._child
 
-    def _ask(self, child: _Child, job: dict[str, Any]) -> Drawn:
+    def _ask(self, child: _Child, job: Json) -> Drawn:
         stdin = child.process.stdin
         assert stdin is not None
         with suppress(OSError, ValueError):  # if it is gone, that shows in the next line

@@ -28,6 +28,7 @@ from prefrl.page.clips.encode import NAME, encode
 from prefrl.protocols import DrawnTask, TaskSettings
 from prefrl.storage.files import write_file
 from prefrl.store import Store
+from prefrl.types import Json
 
 GRACE = 5.0
 """Seconds after a job's limit at which the process ends itself, should nobody have ended it."""
@@ -107,7 +108,7 @@ def _listen(incoming: TextIO, jobs: SimpleQueue[str]) -> None:
     os._exit(0)  # not sys.exit, which would end this thread alone
 
 
-def _reply(artist: Artist, job: dict[str, Any]) -> dict[str, Any]:
+def _reply(artist: Artist, job: Json) -> Json:
     # A thread in C: it ends this process even where a driver hangs without giving Python a turn.
     faulthandler.dump_traceback_later(job["limit"] + GRACE, exit=True, file=sys.stderr.fileno())
     try:
