@@ -106,7 +106,7 @@ class Config(Settings):
         """YAML with every default spelled out; `Config.parse` of it gives the same settings back."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
-    def build(self, store: Store[Any]) -> Loop[Any]:
+    def build(self, store: Store) -> Loop:
         """Make every component, and the loop that joins them, on an open store."""
         from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
 
@@ -132,16 +132,16 @@ class Config(Settings):
     def build_task(self) -> Task:
         return cast(TaskSettings, self.task).build()
 
-    def build_labeler(self, task: Task) -> Labeler[Any]:
+    def build_labeler(self, task: Task) -> Labeler:
         return cast(LabelerSettings, self.labeler).build(task)
 
-    def build_reward(self, task: Task, rng: np.random.Generator) -> RewardModel[Any]:
+    def build_reward(self, task: Task, rng: np.random.Generator) -> RewardModel:
         """Not fitted yet, on the learner's device."""
         model = cast(RewardSettings, self.reward).build(task, rng)
         model.to(device_of(cast(LearnerSettings, self.learner).device))
         return model
 
-    def build_learner(self, task: Task, rng: np.random.Generator) -> Learner[Any]:
+    def build_learner(self, task: Task, rng: np.random.Generator) -> Learner:
         """Raises `ConfigError` for a learner of another package that does not say its discount and device."""
         if not isinstance(self.learner, LearnerSettings):
             raise ConfigError(

@@ -190,14 +190,14 @@ class Labeler(Protocol[C]):
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 
-    def build(self, task: Any) -> Labeler[Any]: ...
+    def build(self, task: Any) -> Labeler: ...
 
 
 @runtime_checkable
 class Attended(Protocol):
     """A labeler for whom something must stand open while the store does: a page that people come to."""
 
-    def open(self, store: Store[Any], fixed: bool = False) -> list[str]:
+    def open(self, store: Store, fixed: bool = False) -> list[str]:
         """Open it on a store that can be written to; returns what people should know, such as a link.
 
         `fixed`: no more will be asked than the store holds, and `answer` is to wait until all of it is answered.
@@ -299,7 +299,7 @@ class RewardModel(Protocol[C_contra]):
 class RewardSettings(Protocol):
     """What chooses a reward model."""
 
-    def build(self, task: Any, rng: np.random.Generator) -> RewardModel[Any]: ...
+    def build(self, task: Any, rng: np.random.Generator) -> RewardModel: ...
 
 
 @runtime_checkable
@@ -362,7 +362,7 @@ class LearnerSettings(Protocol):
     def discount(self) -> float:
         """What a reward a step later counts for in learning; 1 where candidates are scored as a whole."""
 
-    def build(self, task: Any, rng: np.random.Generator) -> Learner[Any]: ...
+    def build(self, task: Any, rng: np.random.Generator) -> Learner: ...
 
 
 class Learner(Protocol[C]):
@@ -400,7 +400,7 @@ class SelectorSettings(Protocol):
     def candidates(self) -> int:
         """How many there are in a query."""
 
-    def build(self) -> Selector[Any]: ...
+    def build(self) -> Selector: ...
 
 
 __all__ = [

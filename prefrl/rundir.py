@@ -51,10 +51,10 @@ class Run:
         self.notes: list[str] = []
         """What a person should know about the start: from where it goes on, which checkpoints were damaged."""
         _refuse_strangers(self.folder)
-        self.store: Store[Any] = Store(self.folder)
+        self.store: Store = Store(self.folder)
         try:
             _claim(config, self.folder, self.store)
-            self.loop: Loop[Any] = config.build(self.store)
+            self.loop: Loop = config.build(self.store)
             self._start_from(reward)
             self._rows = self._restore()
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
@@ -84,7 +84,7 @@ class Run:
         self._events.close()
         self.store.close()
 
-    def __iter__(self) -> Iterator[Round[Any]]:
+    def __iter__(self) -> Iterator[Round]:
         for round in self.loop.run():
             self._record(round)
             yield round
@@ -121,7 +121,7 @@ class Run:
             verify(kept)
             self.loop.reward.load(load_state(kept, "reward"))
 
-    def _record(self, round: Round[Any]) -> None:
+    def _record(self, round: Round) -> None:
         """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""
         row = {"round": round.number} | {k: v if math.isfinite(v) else None for k, v in round.metrics.items()}
         self._rows.append(row)
@@ -146,7 +146,7 @@ class Run:
         self._probes.append(row if self._probes else row | {"candidates": ids})
         write_file(self.folder / "probes.jsonl", "".join(json.dumps(r) + "\n" for r in self._probes).encode())
 
-    def _save_examples(self, round: Round[Any]) -> None:
+    def _save_examples(self, round: Round) -> None:
         """A few candidates to look at, of the starting policy and of the newest one."""
         reward, examples = self.loop.reward, list(round.examples)
         learned = reward.score(examples) if reward.fitted and examples else np.full(len(examples), np.nan)
@@ -190,7 +190,7 @@ class Saved:
     folder: Path
     """The checkpoint itself."""
 
-    def reward(self, task: Task) -> RewardModel[Any]:
+    def reward(self, task: Task) -> RewardModel:
         """The reward model, on a task of the same kind."""
         model = self.config.build_reward(task, streams(self.config.seed, 0).build)
         model.load(load_state(self.folder, "reward"))
@@ -203,7 +203,7 @@ def open_saved(path: str | Path) -> Saved:
     return Saved(saved_config(folder), folder)
 
 
-def save_reward(folder: Path, config: Config, reward: RewardModel[Any], fitted: Fitted | None = None) -> None:
+def save_reward(folder: Path, config: Config, reward: RewardModel, fitted: Fitted | None = None) -> None:
     """Write a reward model with the settings that can build it again, and what its fit came to (`fit.json`)."""
     with whole_folder(folder) as work:
         if fitted is not None:
@@ -230,7 +230,7 @@ def _refuse_strangers(folder: Path) -> None:
         raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
 
 
-def _claim(config: Config, folder: Path, store: Store[Any]) -> None:
+def _claim(config: Config, folder: Path, store: Store) -> None:
     """Make the folder one of these settings, or see that it is already.
 
     Where nothing has happened yet, because a start failed, new settings take the place of the old ones.

@@ -50,7 +50,7 @@ def label(
     """
     if (folder / "checkpoints").exists():
         raise RunError(f"{folder} holds a run, which asks for its own labels: choose another folder")
-    with Store[Any](folder) as store:
+    with Store(folder) as store:
         _keep_config(config, folder)
         loop = config.build(store)
         if policy is not None:
@@ -76,7 +76,7 @@ def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: No
         raise RunError(f"{folder} holds no store: expected the folder of a run, or of `prefrl label`")
     saved_config(folder)  # says what is missing, if it is
     config = Config.load(folder / "config.yaml", ["labeler.kind=web", *overrides])
-    with Store[Any](folder) as store:
+    with Store(folder) as store:
         labeler = config.build_labeler(config.build_task())
         with attended(labeler, store, tell):
             labeler.answer(store, streams(config.seed, 1).label)
@@ -84,7 +84,7 @@ def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: No
 
 
 @contextmanager
-def attended(labeler: Labeler[Any], store: Store[Any], tell: Tell) -> Iterator[None]:
+def attended(labeler: Labeler, store: Store, tell: Tell) -> Iterator[None]:
     """Have open what a labeler's people come to, if there is such a thing; nothing more will be asked."""
     if not isinstance(labeler, Attended):
         yield
@@ -175,7 +175,7 @@ def with_reward(config: Config, saved: Path) -> Config:
     return config.model_copy(update={"reward": reward, "loop": config.loop.model_copy(update={"labels": 0})})
 
 
-def evaluate(folder: Path) -> Evaluation[Any]:
+def evaluate(folder: Path) -> Evaluation:
     """Evaluate the newest policy of a run, with its reward model."""
     saved = open_saved(folder)
     task = saved.config.build_task()
@@ -184,7 +184,7 @@ def evaluate(folder: Path) -> Evaluation[Any]:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
         raise RunError(f"{folder} holds no policy to evaluate: {error}") from error
-    evaluation: Evaluation[Any] = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
+    evaluation: Evaluation = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
     return evaluation
 
 
@@ -272,7 +272,7 @@ def estimate(config: Config) -> float:
     small = shrink(config)
     learner = small.learner.with_evaluation_of(config.learner)
     small = small.model_copy(update={"task": config.task, "learner": learner})
-    with tempfile.TemporaryDirectory() as scratch, Store[Any](Path(scratch)) as store:
+    with tempfile.TemporaryDirectory() as scratch, Store(Path(scratch)) as store:
         loop = small.build(store)
         start, one = (round.metrics for round in loop.run())
     growth = {

@@ -11,10 +11,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import TypeVar
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Integers: TypeAlias = npt.NDArray[np.integer[Any]]
@@ -46,8 +47,8 @@ class Candidate(Protocol):
         """(T,) the task's own values, one for each step, or (1,) for the whole. Hidden from all that learns."""
 
 
-C = TypeVar("C", bound=Candidate)
-C_contra = TypeVar("C_contra", bound=Candidate, contravariant=True)
+C = TypeVar("C", bound=Candidate, default=Any)
+C_contra = TypeVar("C_contra", bound=Candidate, contravariant=True, default=Any)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -33,7 +33,7 @@ errors = Console(stderr=True, highlight=False)
 class _Stage(ProgressColumn):
     """What goes on now, and how fast; read off the loop, which knows nothing of it."""
 
-    def __init__(self, loop: Loop[Any]) -> None:
+    def __init__(self, loop: Loop) -> None:
         super().__init__()
         self.loop = loop
         self.unit = f"{named(loop.task.kind).step}s"
@@ -45,7 +45,7 @@ class _Stage(ProgressColumn):
 
 
 @contextmanager
-def progress(loop: Loop[Any], quiet: bool) -> Iterator[Progress]:
+def progress(loop: Loop, quiet: bool) -> Iterator[Progress]:
     """A bar over the rounds on a terminal; nothing elsewhere, or while a person is asked questions."""
     columns = (SpinnerColumn(), TextColumn("round {task.completed:.0f}/{task.total:.0f}"), BarColumn(24), _Stage(loop))
     bar = Progress(
@@ -133,7 +133,7 @@ def say(text: str, style: str = "") -> None:
     console.print(Text(text, style=style), soft_wrap=True)
 
 
-def round_line(round: Round[Any]) -> Text:
+def round_line(round: Round) -> Text:
     """One round in one line: what matters most first."""
     m = round.metrics
     parts = [

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -87,7 +87,7 @@ def export_(
     from prefrl.exchange.ports import export
     from prefrl.store import Store
 
-    with Store[Any](store, write=False) as opened:
+    with Store(store, write=False) as opened:
         done = export(opened, to, form.value, ties.value)
     for name, count in done.dropped.items():
         say(f"left out: {count} x {name}", "yellow")
@@ -136,12 +136,12 @@ def _try(path: Path, out: Path, which: Which, layout: Layout) -> Imported:
 
     if not has_store(out):
         return try_import(path, None, which, layout)
-    with Store[Any](out, write=False) as store:
+    with Store(out, write=False) as store:
         return try_import(path, store, which, layout)
 
 
 @contextmanager
-def _store(folder: Path) -> Iterator[Store[Any]]:
+def _store(folder: Path) -> Iterator[Store]:
     """The store of a folder. One that had to be made is removed again where something fails."""
     from prefrl.storage.log import has_store
     from prefrl.store import Store
@@ -150,7 +150,7 @@ def _store(folder: Path) -> Iterator[Store[Any]]:
     before = set(folder.iterdir()) if folder.is_dir() else set()
     opened, new = False, not has_store(folder)
     try:
-        with Store[Any](folder) as store:
+        with Store(folder) as store:
             opened = True
             yield store
     except BaseException:

@@ -8,7 +8,7 @@ import sys
 from datetime import datetime
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -250,7 +250,7 @@ def _progress(folder: Path) -> str:
     """How far the queries of a store are answered, by however many people."""
     from prefrl.store import Store
 
-    with Store[Any](folder, write=False) as store:
+    with Store(folder, write=False) as store:
         asked, answered, skipped = store.progress()
     return f"{answered} of {asked} queries answered, {skipped} skipped, in {folder}"
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import comb, sqrt
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -148,7 +148,7 @@ def _degree(width: int, rows: int) -> int:
 
 
 def distance_part(
-    reward: RewardModel[Any],
+    reward: RewardModel,
     candidates: Sequence[Candidate],
     known: Sequence[Candidate],
     discount: float,

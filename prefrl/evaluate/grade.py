@@ -59,8 +59,8 @@ class Habits:
 class Subject:
     """What is graded, and what is known of it."""
 
-    reward: RewardModel[Any]
-    judged: Sequence[Judged[Any]]
+    reward: RewardModel
+    judged: Sequence[Judged]
     """Candidates carry their gold, where there is one."""
     known: Sequence[Candidate] = ()
     """Other segments that carry gold, for the regression that stands in for it."""
@@ -114,8 +114,8 @@ def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
 
 
 def of_run(
-    reward: RewardModel[Any],
-    store: Judgements[Any],
+    reward: RewardModel,
+    store: Judgements,
     folder: Path,
     round: int,
     fitting: FittingSettings,
@@ -141,19 +141,19 @@ def of_run(
     )
 
 
-def judgements(store: Judgements[Any], held_out: float | None = None, upto: int | None = None) -> list[Judged[Any]]:
+def judgements(store: Judgements, held_out: float | None = None, upto: int | None = None) -> list[Judged]:
     """What was judged in a store, with the gold that lies there; only what a fit left out, where a share is given."""
     judged = store.judged(upto)
     kept = split(judged, held_out) if held_out is not None and judged else np.ones(len(judged), bool)
     return [_with_gold(one, store) for one, keep in zip(judged, kept, strict=True) if keep]
 
 
-def _with_gold(one: Judged[Any], store: Judgements[Any]) -> Judged[Any]:
+def _with_gold(one: Judged, store: Judgements) -> Judged:
     known = [replace(c, gold=_gold_of(c, store)) for c in one.query.candidates]
     return Judged(Query(tuple(known)), one.judgement)
 
 
-def _gold_of(candidate: Any, store: Judgements[Any]) -> Floats | None:
+def _gold_of(candidate: Any, store: Judgements) -> Floats | None:
     """None where no gold was ever filed; a file that is torn is an error."""
     try:
         return store.gold([candidate])[0]
@@ -163,7 +163,7 @@ def _gold_of(candidate: Any, store: Judgements[Any]) -> Floats | None:
         raise
 
 
-def _candidates(judged: Sequence[Judged[Any]]) -> list[Candidate]:
+def _candidates(judged: Sequence[Judged]) -> list[Candidate]:
     return list({c.id: c for one in judged for c in one.query.candidates}.values())
 
 

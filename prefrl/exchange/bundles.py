@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from prefrl.exchange.exports.given import Exported, json_text, whole_file
 from prefrl.exchange.reading import parse_json, read_lines, refuse_links
@@ -28,7 +27,7 @@ def is_bundle(path: Path) -> bool:
     return path.is_dir() and (path / EVENTS).exists()
 
 
-def export_bundle(store: Store[Any], path: Path) -> Exported:
+def export_bundle(store: Store, path: Path) -> Exported:
     """Write a folder with every event and every array; the same store gives the same bytes.
 
     Gold stays out, and so do names of people who have not answered, their access, and settings of the project.
@@ -52,7 +51,7 @@ def _event_text(one: Fields) -> str:
     return json_text({name: body if name == "body" else one[name] for name in FIELDS})
 
 
-def import_bundle(path: Path, store: Store[Any]) -> Merged:
+def import_bundle(path: Path, store: Store) -> Merged:
     """Read a folder that `export_bundle` wrote, all or none; what the store has already is left alone.
 
     Raises `ValueError` for what is wrong in it, and `StoreError` where the store holds another judgement of the same
@@ -62,7 +61,7 @@ def import_bundle(path: Path, store: Store[Any]) -> Merged:
     return store.merge(lambda: _events(path / EVENTS), path / BLOBS)
 
 
-def try_bundle(path: Path, store: Store[Any] | None) -> Merged:
+def try_bundle(path: Path, store: Store | None) -> Merged:
     """What `import_bundle` would do, by the same checks, with nothing written. A store may be open for reading."""
     _check_files(path)
     if store is None:

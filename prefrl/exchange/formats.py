@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from prefrl.exchange.layout import Layout, Parts, Row, Which
 from prefrl.exchange.reading import TABLES, list_files
@@ -26,7 +25,7 @@ HUMAN, SCRIPT = "human", "script"
 class Read:
     """What a file holds."""
 
-    judged: tuple[Judged[Any], ...]
+    judged: tuple[Judged, ...]
     notes: tuple[str, ...] = ()
     """What was left out, for people."""
 

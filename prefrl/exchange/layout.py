@@ -16,7 +16,7 @@ from prefrl.types import Fields, Json, Query, Response, is_whole
 class Row(NamedTuple):
     """One answer of a file."""
 
-    query: Query[Any]
+    query: Query
     answer: Answer
     """Its labeler is "" where the file names none."""
     split: str = ""
@@ -27,7 +27,7 @@ class Row(NamedTuple):
     """Its labeler, numbered among the answers to the query that is named."""
 
     @property
-    def judged(self) -> Judged[Any]:
+    def judged(self) -> Judged:
         """The judgement; for rows that are no skip."""
         if self.answer.reason is not None:
             raise ValueError("a skip is no judgement")
@@ -94,7 +94,7 @@ def answered(row: Fields, candidates: Sequence[Any], verdict: Callable[..., Answ
 
     `verdict` is given `order`, where `order[i]` is where candidate i stands in the query.
     """
-    query = Query[Any](tuple(candidates))
+    query = Query(tuple(candidates))
     place = {candidate.id: i for i, candidate in enumerate(query.candidates)}
     order = [place[candidate.id] for candidate in candidates]
     who = {

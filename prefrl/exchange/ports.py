@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sql
 
@@ -42,7 +41,7 @@ class Imported:
 # --- out ----------------------------------------------------------------------------------------------------------
 
 
-EXPORTS: Mapping[str, Callable[[Store[Any], Path, str], Exported]] = {
+EXPORTS: Mapping[str, Callable[[Store, Path, str], Exported]] = {
     "preferences": lambda store, path, ties: export_preferences(store, path, ties),
     "conversational": lambda store, path, ties: export_preferences(store, path, ties, conversational=True),
     "unpaired": lambda store, path, _: export_unpaired(store, path),
@@ -59,7 +58,7 @@ EXPORTS: Mapping[str, Callable[[Store[Any], Path, str], Exported]] = {
 """What writes each form; the text says what becomes of ties, where a form has none: "drop" or "both"."""
 
 
-def export(store: Store[Any], path: Path, form: str = "preferences", ties: str = "drop") -> Exported:
+def export(store: Store, path: Path, form: str = "preferences", ties: str = "drop") -> Exported:
     """Write the answers of a store to a file or a folder, whole or not at all."""
     if ties != "drop" and form not in ("preferences", "conversational"):
         raise ValueError(f"ties={ties!r} is for preferences and conversational; the form {form!r} has its own way")
@@ -69,9 +68,7 @@ def export(store: Store[Any], path: Path, form: str = "preferences", ties: str =
 # --- in -----------------------------------------------------------------------------------------------------------
 
 
-def import_judgements(
-    path: Path, store: Store[Any], which: Which | None = None, layout: Layout | None = None
-) -> Imported:
+def import_judgements(path: Path, store: Store, which: Which | None = None, layout: Layout | None = None) -> Imported:
     """Read a file of judgements (`read_judgements` says which), or a bundle, into a store, all or none.
 
     A second reading changes nothing. Raises `ValueError` for what is wrong in the file, and `StoreError` where the
@@ -91,9 +88,7 @@ def import_judgements(
     return Imported(arrived.read, checked.notes, arrived.known)
 
 
-def try_import(
-    path: Path, store: Store[Any] | None, which: Which | None = None, layout: Layout | None = None
-) -> Imported:
+def try_import(path: Path, store: Store | None, which: Which | None = None, layout: Layout | None = None) -> Imported:
     """What `import_judgements` would do, by the same checks, with nothing written. A store may be open for reading."""
     if is_bundle(path):
         _refuse_choice(path, which, layout)
@@ -121,7 +116,7 @@ def _refuse_choice(path: Path, which: Which | None, layout: Layout | None) -> No
 class _Arrived:
     """Rows of a file beside what a store holds."""
 
-    def __init__(self, path: Path, store: Store[Any]) -> None:
+    def __init__(self, path: Path, store: Store) -> None:
         self.path, self.store = path, store
         self.read = self.known = 0
         self.against = Against()
@@ -150,7 +145,7 @@ def _standing(connection: sql.Connection, answers: Mapping[tuple[str, str], Answ
         yield read_answer(one.kind, one.subject, one.actor, one.body)
 
 
-def _put(store: Store[Any], tx: Transaction, some: Sequence[Row]) -> None:
+def _put(store: Store, tx: Transaction, some: Sequence[Row]) -> None:
     """Write answers with their queries in a transaction; arrays first, since a file cannot be undone but be unused."""
     candidates: dict[str, Candidate] = {c.id: c for one in some for c in one.query.candidates}
     for candidate in candidates.values():

@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sql
 
@@ -32,7 +31,7 @@ def recognised(connection: sql.Connection, rows: Sequence[Row], blobs: Path) -> 
     return [_placed(row, there[row.named]) if row.named in there else row for row in rows]
 
 
-def _placed(row: Row, query: Query[Any]) -> Row:
+def _placed(row: Row, query: Query) -> Row:
     """A row as an answer to the query that it names; as it is where the candidates are others."""
     places = {_bare(candidate): at for at, candidate in enumerate(query.candidates)}
     own = [_bare(candidate) for candidate in row.query.candidates]

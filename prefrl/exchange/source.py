@@ -26,16 +26,16 @@ from prefrl.types import Floats, Json, Query
 class InMemory:
     """A `prefrl.protocols.Judgements` of a file: all of them there, and nothing beside them."""
 
-    of_file: tuple[Judged[Any], ...]
+    of_file: tuple[Judged, ...]
 
     @property
     def sequence(self) -> int:
         return len(self.of_file)
 
-    def judged(self, upto: int | None = None) -> list[Judged[Any]]:
+    def judged(self, upto: int | None = None) -> list[Judged]:
         return list(self.of_file[:upto])
 
-    def open_queries(self, labeler: str = "") -> list[Query[Any]]:
+    def open_queries(self, labeler: str = "") -> list[Query]:
         return []
 
     def gold(self, candidates: Sequence[Any]) -> list[Floats]:
@@ -45,7 +45,7 @@ class InMemory:
 class Opened(NamedTuple):
     """Judgements, ready to be read."""
 
-    store: Judgements[Any]
+    store: Judgements
     notes: tuple[str, ...]
     """What was left out of a file, for people."""
 
@@ -60,25 +60,25 @@ def open_judgements(source: Path, task: Any, which: Which | None = None) -> Iter
     """
     with ExitStack() as stack:
         if source.is_dir() and not (which and (which.labelers or which.split)):
-            opened = Opened(stack.enter_context(Store[Any](source, write=False)), ())
+            opened = Opened(stack.enter_context(Store(source, write=False)), ())
         elif not source.is_dir() and not is_bundle(source):
             read = read_judgements(source, which)
             opened = Opened(InMemory(read.judged), read.notes)
         else:
             # Entered first, so removed last: the store in it is closed by then.
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            opened = _chosen(source, stack.enter_context(Store[Any](scratch)), which)
+            opened = _chosen(source, stack.enter_context(Store(scratch)), which)
         check_candidates(opened.store.judged(), task)
         yield opened
 
 
-def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
+def _chosen(source: Path, store: Store, which: Which | None) -> Opened:
     """Fill an empty store with what is chosen of a folder's store or of a file."""
     if which is None or not source.is_dir():
         return Opened(store, import_judgements(source, store, which).notes)
     if which.split:
         raise ValueError(f"{source} is a store, which knows no split: give a file, or leave the split out")
-    with Store[Any](source, write=False) as whole:
+    with Store(source, write=False) as whole:
         names = {e["actor"] for e in whole.events() if e["kind"] in ANSWERS}
         if not any(map(which.takes, names)):
             known = ", ".join(sorted(set(map(person, names)) - {""})) or "none"
@@ -87,7 +87,7 @@ def _chosen(source: Path, store: Store[Any], which: Which | None) -> Opened:
     return Opened(store, ())
 
 
-def _events(store: Store[Any], which: Which) -> Iterator[Json]:
+def _events(store: Store, which: Which) -> Iterator[Json]:
     """What was asked, and what those have said of it who are wanted."""
     for one in store.events():
         said = one["kind"] in (*ANSWERS, "retract") and which.takes(one["actor"])
@@ -95,7 +95,7 @@ def _events(store: Store[Any], which: Which) -> Iterator[Json]:
             yield one
 
 
-def check_candidates(judged: Sequence[Judged[Any]], task: Any) -> None:
+def check_candidates(judged: Sequence[Judged], task: Any) -> None:
     """Raise `ValueError` unless all candidates are of the task's kind, and as its behaviours are."""
     for candidate in (c for one in judged for c in one.query.candidates):
         kind = kind_of(candidate)

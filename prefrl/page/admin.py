@@ -135,7 +135,7 @@ def _export(served: Service, name: str) -> tuple[Path, Exported]:
     folder = Path(tempfile.mkdtemp(prefix="prefrl-export-"))
     path = folder / f"{name}{named(served.terms.page.kind).exports[name]}"
     try:
-        with Store[Any](served.store.folder, write=False) as store:
+        with Store(served.store.folder, write=False) as store:
             done = export(store, path, name)
         return Path(shutil.make_archive(str(path), "zip", path)) if path.is_dir() else path, done
     except BaseException:

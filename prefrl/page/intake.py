@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import Any
 
 import sqlalchemy as sql
 from sqlalchemy import Connection
@@ -58,7 +57,7 @@ class Reopened:
 class Intake:
     """See the module's docstring."""
 
-    store: Store[Any]
+    store: Store
     desk: Desk
     strengths: dict[str, float]
     """slight, clear and much as preferences."""

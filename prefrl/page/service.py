@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Condition, Lock
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from sqlalchemy.exc import OperationalError
 from starlette.concurrency import run_in_threadpool
@@ -46,7 +46,7 @@ T = TypeVar("T")
 class Service:
     """See the module's docstring. `open` before use, `close` after."""
 
-    store: Store[Any]
+    store: Store
     terms: Terms
     clips: ClipSource | None = None
     clock: Callable[[], float] = time.monotonic
@@ -186,7 +186,7 @@ class Service:
 
         await self.write(lambda tx: tx.append(event), note)
 
-    async def ask(self, queries: Sequence[Query[Any]]) -> None:
+    async def ask(self, queries: Sequence[Query]) -> None:
         """Ask what a trainer elsewhere wants to know; what was asked before is left alone."""
         try:
             await run_in_threadpool(self.store.ask, queries)

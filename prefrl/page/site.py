@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from prefrl.components import ConfigError
 from prefrl.page import records
@@ -137,7 +136,7 @@ class Site:
         self._pause = SPARING * (time.thread_time() - begin)
 
 
-def open_site(store: Store[Any], terms: Terms, address: Address, name: str, clips: ClipSettings | None) -> Site:
+def open_site(store: Store, terms: Terms, address: Address, name: str, clips: ClipSettings | None) -> Site:
     """Open the service, and serve it. Raises `ConfigError` where the address is taken.
 
     `name`: the admin whose link is printed. `clips`: how clips are drawn, None where candidates need none.

@@ -41,7 +41,7 @@ SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_
 """The Hub's size categories."""
 
 
-def export_dataset(store: Store[Any], path: Path) -> Exported:
+def export_dataset(store: Store, path: Path) -> Exported:
     """Write a folder with two configurations in Parquet and a README.md that is the card of a data set.
 
     `preferences`, the default, has `prompt`, `chosen`, `rejected` of every decided pair, and `margin` where strengths
@@ -58,7 +58,7 @@ def export_dataset(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, f"{pairs} pairs for training and {written} judgements", note)
 
 
-def _pairs(store: Store[Any], margins: bool) -> Iterator[Json]:
+def _pairs(store: Store, margins: bool) -> Iterator[Json]:
     for pair in each_pair(store, Tally(), "dataset"):
         if pair.preference > 0.5:
             row = {"prompt": pair.chosen.prompt, "chosen": pair.chosen.text, "rejected": pair.rejected.text}
@@ -101,7 +101,7 @@ def _write(path: Path, rows: Iterable[Fields], columns: Any) -> int:
 # --- the card -----------------------------------------------------------------------------------------------------
 
 
-def _card(store: Store[Any], pairs: int, judgements: int, margins: bool) -> str:
+def _card(store: Store, pairs: int, judgements: int, margins: bool) -> str:
     size = next((name for limit, name in SIZES if judgements < limit), "n>1M")
     files = [
         {"config_name": name, "data_files": [{"split": "train", "path": f"{name}/{FILE}"}]}
@@ -130,7 +130,7 @@ def _card(store: Store[Any], pairs: int, judgements: int, margins: bool) -> str:
     )
 
 
-def _protocol(store: Store[Any]) -> str:
+def _protocol(store: Store) -> str:
     """The guideline that the annotators had last, set off so that nothing in it is markup."""
     newest = sql.select(event.c.body).where(event.c.kind == "guideline").order_by(event.c.seq.desc()).limit(1)
     with store.log.reading() as connection:
@@ -141,7 +141,7 @@ def _protocol(store: Store[Any]) -> str:
     return f"The newest guideline that annotators were given:\n\n{lines}"
 
 
-def _figures(store: Store[Any]) -> tuple[dict[str, int], int, str]:
+def _figures(store: Store) -> tuple[dict[str, int], int, str]:
     """Answers by kind, how many annotators there are, and how often two of them agree."""
     kinds, labelers, sides = dict[str, int](), set[str](), dict[str, list[int]]()
     for given in each_answer(store):

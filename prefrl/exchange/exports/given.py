@@ -53,7 +53,7 @@ class Given(NamedTuple):
 
     at: str
     answer: Answer
-    query: Query[Any]
+    query: Query
     about: Fields
 
 
@@ -68,7 +68,7 @@ class Exported:
     """What else to know of the file, for people."""
 
 
-def each_answer(store: Store[Any]) -> Iterator[Given]:
+def each_answer(store: Store) -> Iterator[Given]:
     """Every answer that stands, oldest first, skips included, those to check questions not; few in memory at a time."""
     with store.log.reading() as connection:
         for some in _standing(connection):
@@ -78,7 +78,7 @@ def each_answer(store: Store[Any]) -> Iterator[Given]:
                 yield Given(e["at"], answer, queries[e["subject"]], e["body"].get("about") or {})
 
 
-def each_query(store: Store[Any]) -> Iterator[list[Given]]:
+def each_query(store: Store) -> Iterator[list[Given]]:
     """The answers to each query that stand, in the order in which the queries were first answered; few in memory."""
     seen = set[str]()
     with store.log.reading() as connection:
@@ -99,7 +99,7 @@ def _answers_to(connection: sql.Connection, ids: Collection[str]) -> Iterator[sq
     yield from connection.execute(some.where(event.c.kind.in_(ANSWERS)).order_by(event.c.seq))
 
 
-def knows_strengths(store: Store[Any]) -> bool:
+def knows_strengths(store: Store) -> bool:
     """Whether any preference is neither a tie nor a certainty."""
     with store.log.reading() as connection:
         found = (e for some in _standing(connection) for e in some)
@@ -115,7 +115,7 @@ def _standing(connection: sql.Connection) -> Iterator[list[Json]]:
         yield [e for e in some if newest[e["subject"], e["actor"]]["seq"] == e["seq"] and e["subject"] in labels]
 
 
-def stored_queries(connection: sql.Connection, ids: Collection[str], blobs: Path) -> dict[str, Query[Any]]:
+def stored_queries(connection: sql.Connection, ids: Collection[str], blobs: Path) -> dict[str, Query]:
     """Queries by id. Not the store's own, which keeps all that it was ever asked for."""
     queries = bodies(connection, ids)
     found = bodies(connection, {c for body in queries.values() for c in body["candidates"]})
@@ -157,7 +157,7 @@ class Tally:
         """Count a skip that has no place in the form."""
         self.dropped[INCOMPARABLE if reason == "incomparable" else SKIP] += 1
 
-    def done(self, store: Store[Any], written: int, *notes: str) -> Exported:
+    def done(self, store: Store, written: int, *notes: str) -> Exported:
         """The tally, with what the store holds beside answers."""
         with store.log.reading() as connection:
             kinds = sql.select(event.c.kind, sql.func.count()).where(event.c.kind.in_(OF_EVENTS)).group_by(event.c.kind)

@@ -36,7 +36,7 @@ NOTES = (
 )
 
 
-def export_minari(store: Store[Any], path: Path) -> Exported:
+def export_minari(store: Store, path: Path) -> Exported:
     """Write a folder that `minari.MinariDataset` opens: every judged segment is an episode, cut off at its end.
 
     The options of an episode say which `candidate` it is, of which `episode` and from which `start` on. `labels.jsonl`
@@ -56,7 +56,7 @@ def export_minari(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, f"{len(episodes)} segments as episodes", *NOTES)
 
 
-def _segments(store: Store[Any]) -> Iterator[Segment]:
+def _segments(store: Store) -> Iterator[Segment]:
     """Every segment that was judged or skipped, once."""
     seen = set[str]()
     error = StoreError("responses are no trajectories, and do not fit Minari; use another form")
@@ -102,7 +102,7 @@ def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
     episodes[segment.id] = len(episodes)
 
 
-def _labels(store: Store[Any], tally: Tally, episodes: Mapping[str, int]) -> Iterator[Json]:
+def _labels(store: Store, tally: Tally, episodes: Mapping[str, int]) -> Iterator[Json]:
     for given in each_answer(store):
         tally.note(given)
         compared = {"query": given.query.id, "episodes": [episodes[c.id] for c in given.query.candidates]}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from prefrl.exchange.exports.given import (
     LABELER,
@@ -68,7 +68,7 @@ class Conversations:
         return (f"{len(self.untold)} x {UNTOLD}",) if self.untold else ()
 
 
-def each_pair(store: Store[Any], tally: Tally, form: str) -> Iterator[Pair]:
+def each_pair(store: Store, tally: Tally, form: str) -> Iterator[Pair]:
     """Every pair that the judgements imply, ties included; what has no pair is counted."""
     for given in each_answer(store):
         refuse_segments(given, form)
@@ -85,7 +85,7 @@ def each_pair(store: Store[Any], tally: Tally, form: str) -> Iterator[Pair]:
             yield Pair(given, texts[better], texts[worse], max(preference, 1.0 - preference))
 
 
-def export_preferences(store: Store[Any], path: Path, ties: str = "drop", conversational: bool = False) -> Exported:
+def export_preferences(store: Store, path: Path, ties: str = "drop", conversational: bool = False) -> Exported:
     """Write one JSON object a line with `prompt`, `chosen`, `rejected`: every decided pair that the judgements imply.
 
     Where the store holds strengths there is a `margin`: the log-odds of the preference, which in the Bradley-Terry
@@ -117,7 +117,7 @@ def margin(preference: float) -> float:
     return 0.0 if preference == 1.0 else math.log(preference / (1.0 - preference))
 
 
-def export_unpaired(store: Store[Any], path: Path, conversational: bool = False) -> Exported:
+def export_unpaired(store: Store, path: Path, conversational: bool = False) -> Exported:
     """Write one JSON object a line with `prompt`, `completion`, `label`: whether a response is good.
 
     A rating is good in the upper half of its scale, bad in the lower. In what compares, a response is good that is
@@ -127,7 +127,7 @@ def export_unpaired(store: Store[Any], path: Path, conversational: bool = False)
     return tally.done(store, write_lines(path, _unpaired(store, tally, say)), *say.notes())
 
 
-def _unpaired(store: Store[Any], tally: Tally, say: Conversations) -> Iterator[Json]:
+def _unpaired(store: Store, tally: Tally, say: Conversations) -> Iterator[Json]:
     for given in each_answer(store):
         refuse_segments(given, "unpaired")
         tally.note(given)
@@ -145,13 +145,13 @@ def _unpaired(store: Store[Any], tally: Tally, say: Conversations) -> Iterator[J
                 yield row | {"label": label}
 
 
-def export_judgements(store: Store[Any], path: Path) -> Exported:
+def export_judgements(store: Store, path: Path) -> Exported:
     """Write one JSON object a line with `prompt`, `responses` and the answer as it was given, skips included."""
     tally = Tally({LABELER, ORDER, TIME, STRENGTH, WEIGHT, WHOLE})
     return tally.done(store, write_lines(path, each_judgement(store, tally)))
 
 
-def each_judgement(store: Store[Any], tally: Tally) -> Iterator[Json]:
+def each_judgement(store: Store, tally: Tally) -> Iterator[Json]:
     """Every answer as a row of its prompt, its responses in the query's order, and the answer."""
     for given in each_answer(store):
         refuse_segments(given, "judgements")

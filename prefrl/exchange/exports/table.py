@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from prefrl.exchange.exports.given import LABELER, STRENGTH, TIME, WEIGHT, Exported, Tally, whole_file
 from prefrl.exchange.exports.rows import Pair, each_pair
@@ -17,7 +17,7 @@ TEXTS = ("prompt", "chosen", "rejected", "labeler")
 COLUMNS = ("prompt", "chosen", "rejected", "preference", "labeler", "weight", "at", "query", GUARDED)
 
 
-def export_csv(store: Store[Any], path: Path) -> Exported:
+def export_csv(store: Store, path: Path) -> Exported:
     """Write every pair that the judgements imply, ties included: a tie has the preference 0.5.
 
     A cell that a spreadsheet would take for a formula gets an apostrophe before it, as does an empty text; the column
@@ -33,7 +33,7 @@ def export_csv(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, *([note] if changed else []))
 
 
-def _write(store: Store[Any], tally: Tally, file: IO[bytes]) -> tuple[int, int]:
+def _write(store: Store, tally: Tally, file: IO[bytes]) -> tuple[int, int]:
     """How many rows were written, and in how many a cell was guarded."""
     text, written, changed = TextIOWrapper(file, "utf-8", newline="", write_through=True), 0, 0
     try:

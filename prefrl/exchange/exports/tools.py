@@ -31,7 +31,7 @@ from prefrl.types import Fields, Json, Response
 SOME_RATING = "rating, for which records hold no question"
 
 
-def _by_query(store: Store[Any], tally: Tally, form: str) -> Iterator[list[Given]]:
+def _by_query(store: Store, tally: Tally, form: str) -> Iterator[list[Given]]:
     """The answers to each query, in the order in which the queries were first answered."""
     for group in each_query(store):
         for given in group:
@@ -43,7 +43,7 @@ def _by_query(store: Store[Any], tally: Tally, form: str) -> Iterator[list[Given
 # --- Argilla ------------------------------------------------------------------------------------------------------
 
 
-def export_argilla(store: Store[Any], path: Path) -> Exported:
+def export_argilla(store: Store, path: Path) -> Exported:
     """Write a JSON list of records of Argilla 2, as its `Dataset.records.to_json` does: one a query.
 
     Fields `prompt`, `response_1` and so on; the question `preference` for pairs (a field's name or "tie"), `ranking`
@@ -93,7 +93,7 @@ def _argilla_answer(answer: Answer, names: Sequence[str]) -> tuple[str, Any, str
 # --- Label Studio -------------------------------------------------------------------------------------------------
 
 
-def export_label_studio(store: Store[Any], path: Path) -> Exported:
+def export_label_studio(store: Store, path: Path) -> Exported:
     """Write a JSON list of tasks of Label Studio with their annotations: one a pair of responses.
 
     The data are `prompt`, `left` and `right`; a `pairwise` result says which is better, a result of the `choices`
@@ -155,7 +155,7 @@ def _swapped(result: list[Json]) -> list[Json]:
 # --- the arena ----------------------------------------------------------------------------------------------------
 
 
-def export_arena(store: Store[Any], path: Path) -> Exported:
+def export_arena(store: Store, path: Path) -> Exported:
     """Write one JSON object a line as the LMSYS arena publishes its battles: two conversations and a winner.
 
     Which models wrote the responses is unknown to a store. What is incomparable is called "tie (bothbad)".
@@ -166,7 +166,7 @@ def export_arena(store: Store[Any], path: Path) -> Exported:
     return tally.done(store, written, *notes, *([f"{len(untold)} x {UNTOLD}"] if untold else []))
 
 
-def _battles(store: Store[Any], tally: Tally, untold: set[str]) -> Iterator[Json]:
+def _battles(store: Store, tally: Tally, untold: set[str]) -> Iterator[Json]:
     for given in each_answer(store):
         refuse_segments(given, "arena")
         tally.note(given)

@@ -45,7 +45,7 @@ class Artist:
     """Draws the candidates of one store, by the task that the folder's settings name."""
 
     folder: Path
-    _store: Store[Any] | None = field(default=None, init=False)
+    _store: Store | None = field(default=None, init=False)
 
     def draw(self, candidate: str, file: str) -> int:
         """Write the clip of a candidate; returns its bytes. Raises `ValueError` where it cannot be drawn."""
@@ -74,7 +74,7 @@ class Artist:
             raise JobError(f"the task {task.name} is of kind {task.kind!r}, and has no clips")
         return cast(DrawnTask[Any], task)
 
-    def _opened(self) -> Store[Any]:
+    def _opened(self) -> Store:
         if self._store is None:
             self._store = Store(self.folder, write=False)
         return self._store
