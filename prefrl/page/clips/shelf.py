@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 
-from prefrl.page.clips.encode import NAME, whole
+from prefrl.page.clips.encode import NAME
 
 UNFINISHED = re.compile(f"[.]{NAME.pattern}-[0-9a-f]{{12}}")
 """What is left where a process was ended while it wrote."""
@@ -51,13 +51,12 @@ class Shelf:
             self._make_room()
 
     def find(self, name: str) -> Path | None:
-        """Where a clip lies, if it does, whole. Looked at each time: a cache may be emptied by anybody."""
+        """Where a clip lies, if it does. Looked at each time: a cache may be emptied by anybody."""
         path = self._path(name)
         size = _regular(path)
-        there = size is not None and whole(path)
         with self._turn:
-            self._put(name, size if there and size is not None else None)
-        return path if there else None
+            self._put(name, size or None)
+        return path if size else None
 
     def add(self, name: str) -> bool:
         """Count a clip that was just drawn, and make room; whether it is there."""
