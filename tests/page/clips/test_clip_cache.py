@@ -199,7 +199,7 @@ def test_a_query_is_drawn_beside_an_open_store_in_each_format_that_is_asked_for(
     first, second = ([n.removeprefix("/media/") for n in clips.names(c.id)] for c in query.candidates)
     with Store[Segment](folder):
         drawn = [asyncio.run(clips.get(n, 60)) for n in first]
-        assert all(map(whole, drawn))
+        assert all(path.stat().st_size > 0 for path in drawn)
         assert [path.suffix.removeprefix(".") for path in drawn] == list(encoding.formats())
         clips.want(query.candidates[1].id)
         until(lambda: clips.counts()["waiting"] == 0, 60)
