@@ -299,3 +299,12 @@ def test_an_algorithm_that_does_not_know_legal_moves_is_stopped_at_the_first_tha
     learner = _learner(corridor(), PPO)
     with pytest.raises(ValueError, match=r"is not legal there; .* learner.kind=control"):
         learner.sample(10, np.random.default_rng(0))
+
+
+@both
+def test_an_evaluation_plays_the_mode_whatever_the_global_generators_say(algorithm: dict[str, Any]) -> None:
+    learner, gold = _learner(point(), algorithm), []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        gold.append(learner.evaluate(Known(), np.random.default_rng(0)).metrics)
+    assert gold[0] == gold[1]
