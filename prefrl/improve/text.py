@@ -18,7 +18,15 @@ from torch import Tensor
 
 from prefrl.components import Settings, filled_in
 from prefrl.improve.gradient import Batch, Objective, update
-from prefrl.improve.objectives import AdaptiveKL, Reduction, group_normalised, kl_k1, leave_one_out, step_rewards
+from prefrl.improve.objectives import (
+    AdaptiveKL,
+    Reduction,
+    group_normalised,
+    kl_k1,
+    leave_one_out,
+    masked_mean,
+    step_rewards,
+)
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
@@ -196,7 +204,7 @@ class TextLearner:
                 "reward": float(raw.mean()),
                 "reward_std": float(raw.std(correction=0)),
                 **({"kl": sequence_kl} if settings.beta else {}),  # what was not measured is absent, not 0
-                "surprise": -float(drawn.logp.sum() / drawn.count),
+                "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
                 "length": float(drawn.mask.sum(1).float().mean()),
                 "ended": float(drawn.ended.float().mean()),
                 "beta": self._kl.beta,
