@@ -18,6 +18,7 @@ import postgres_server
 import pytest
 import runs
 import torch
+from hypothesis import settings
 
 from prefrl.config import Config
 from prefrl.store import Store
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 
 
 pytest_plugins = ["budget", "pytester"]
+
+
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")  # how long an example takes hangs on what else the machine does
 
 
 @pytest.fixture(autouse=True, scope="session")
