@@ -43,8 +43,6 @@ class Objective:
     """False: the critic alone learns."""
     value: float = 0.0
     """Weight of the critic's loss."""
-    value_clip: float | None = None
-    """How far a value may move from the old one and still count as better."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     beta: float = 0.0
@@ -67,8 +65,6 @@ class Batch(Generic[I]):
     """(B, L), or (B, 1) where all steps of a sequence have the same."""
     returns: Tensor | None = None
     """(B, L) the critic's targets."""
-    values: Tensor | None = None
-    """(B, L) what the critic said when they were drawn."""
     reference: Tensor | None = None
     """(B, L) log-probabilities under the reference policy."""
 
@@ -84,7 +80,7 @@ class Batch(Generic[I]):
             return None if steps is None else steps[at, :width]
 
         advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
-        return Batch(inputs, logp, advantages, cut(self.returns), cut(self.values), cut(self.reference))
+        return Batch(inputs, logp, advantages, cut(self.returns), cut(self.reference))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
         """Parts of at most `size` sequences of like length, so that little padding is computed on; all at once for
@@ -207,9 +203,7 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
 def _value(policy: Policy[I], batch: Batch[I], objective: Objective) -> Tensor:
     """The critic's loss, summed over steps."""
     assert batch.returns is not None
-    # Old values are read by the value clip alone.
-    values, old = policy.values(batch.inputs), batch.returns if batch.values is None else batch.values
-    return masked_sum(value_loss(values, old, batch.returns, objective.value_clip), batch.inputs.mask)
+    return masked_sum(value_loss(policy.values(batch.inputs), batch.returns), batch.inputs.mask)
 
 
 def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Tensor]:

@@ -131,13 +131,9 @@ def clipped_surrogate(log_ratios: Tensor, advantages: Tensor, clip: float) -> Te
     return -torch.minimum(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
 
 
-def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip: float | None = None) -> Tensor:
-    """Half the squared error; with a clip the larger one of the free and the clipped prediction's (PPO2)."""
-    free = (values - returns) ** 2
-    if clip is None:
-        return 0.5 * free
-    near = old_values + (values - old_values).clamp(-clip, clip)
-    return 0.5 * torch.maximum(free, (near - returns) ** 2)
+def value_loss(values: Tensor, returns: Tensor) -> Tensor:
+    """Half the squared error."""
+    return 0.5 * (values - returns) ** 2
 
 
 def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:

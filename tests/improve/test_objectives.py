@@ -228,12 +228,6 @@ def test_log_ratios_are_bounded_and_zero_on_padding() -> None:
     torch.testing.assert_close(got, torch.tensor([[o.MAX_LOG_RATIO, 0.0]]))
 
 
-def test_value_loss_takes_the_worse_of_free_and_clipped() -> None:
-    values, old, returns = torch.tensor([2.0, 0.1]), torch.zeros(2), torch.tensor([2.0, 0.0])
-    torch.testing.assert_close(o.value_loss(values, old, returns), torch.tensor([0.0, 0.005]))
-    torch.testing.assert_close(o.value_loss(values, old, returns, 0.2), torch.tensor([0.5 * 1.8**2, 0.005]))
-
-
 def test_the_adaptive_coefficient_moves_towards_its_target_and_no_faster_than_allowed() -> None:
     start = o.AdaptiveKL(beta=0.1, target=6.0, horizon=1000)
     assert start.update(6.0, 100).beta == pytest.approx(0.1)
