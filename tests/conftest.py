@@ -6,12 +6,11 @@ import math
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import postgres_server
@@ -50,14 +49,8 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _warm(request: pytest.FixtureRequest, _own_cache: None) -> None:
     """Where tests are held to a budget: what they all need is there, so that none pays for it by being the first."""
     if request.config.getoption("--budget"):
-        for name in (
-            "torch.utils.tensorboard",
-            "transformers.models.gpt2.modeling_gpt2",
-            "matplotlib.pyplot",
-            "mujoco",
-        ):
-            with suppress(ImportError):
-                import_module(name)
+        for name in ("torch.utils.tensorboard", "transformers.models.gpt2.modeling_gpt2", "matplotlib.pyplot"):
+            import_module(name)
         request.getfixturevalue("finished_tiny")
 
 
@@ -164,7 +157,8 @@ def reviews_policy(tmp_path_factory: pytest.TempPathFactory, _own_cache: None) -
     """The starting policy of "text/reviews" has been made, which takes minutes, once for all tests."""
 
     def make(folder: Path) -> None:
-        Config.load("text/reviews").task.build()
+        task: Any = Config.load("text/reviews").task
+        task.build()
         folder.mkdir()
 
     runs.made_once(tmp_path_factory, "reviews-policy", make)
