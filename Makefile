@@ -13,7 +13,7 @@ SEED := $(shell od -An -N4 -tu4 /dev/urandom | tr -d ' ')
 endif
 export SEED
 
-.PHONY: demo test reading running tests lint types layers unit slow browser docs cover budget nightly peers clean
+.PHONY: demo test reading running tests lint types layers unit slow browser docs cover budget nightly mutants peers clean
 
 demo: .venv/demo
 	$(BIN)/prefrl run control/pendulum --out runs/pendulum
@@ -35,7 +35,7 @@ reading: .venv/dev
 	$(MAKE) --no-print-directory types
 
 running: .venv/dev
-	+.ci/in_memory $(MAKE) --no-print-directory tests
+	+.ci/in_memory --shared $(MAKE) --no-print-directory tests
 
 # One after another, whatever make is told: each takes all cores. Browsers need a run of their own: Playwright's event
 # loop lives in the main thread.
@@ -63,8 +63,12 @@ slow: .venv/dev
 browser: .venv/dev
 	$(PYTEST) -m browser
 
-nightly: .venv/dev
+nightly: .venv/dev mutants
 	$(PYTEST) -m nightly
+
+# Breaks the product in one place at a time: do the tests notice?
+mutants: .venv/dev
+	.ci/in_memory $(BIN)/python tests/mutants/mutate.py
 
 cover: .venv/dev
 	$(PYTEST) --cov --cov-report=term

@@ -39,8 +39,8 @@ from typing import Any
 import numpy as np
 from labelling import Browser, Server, admit, free_port
 
-from prefrl.maintenance import verify_store
-from prefrl.projection import ANSWERS
+from prefrl.storage.maintenance import verify_store
+from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
 
 AHEAD = 2

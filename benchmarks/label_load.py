@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from labelling import DEFAULT_RATE, Browser, Server, admit, cpu_seconds, free_port
 
-from prefrl.projection import ANSWERS
+from prefrl.storage.projection import ANSWERS
 from prefrl.store import Store
 
 TARGET_MS = 250.0

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from prefrl.label.server.access import Access
-from prefrl.label.server.records import closed, store_id
 from prefrl.label.web import WebSettings
+from prefrl.page.access import Access
+from prefrl.page.records import closed, store_id
 from prefrl.store import Store
 from prefrl.types import Query, Response
 
@@ -97,7 +97,7 @@ def serve(folder: Path, settings: WebSettings, wanted: int) -> None:
 
 def live_again(life: Callable[[], None]) -> None:
     """A new process for each line of the standard input, one after the other."""
-    import prefrl.label.server.site  # noqa: F401
+    import prefrl.page.site  # noqa: F401
 
     for _ in sys.stdin:
         told, tell = os.pipe()  # a life begins to speak once its number was said

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from prefrl.judgements import Comparison, Judged
 from prefrl.reward_models.mlp import MLPSettings
-from prefrl.types import Comparison, Judged, Query, Segment
+from prefrl.types import Query, Segment
 
 STEPS, OBSERVATION, ACTION, HIDDEN = 25, 6, 2, 32
 

@@ -115,8 +115,9 @@ def ours() -> Any:
 
     from prefrl.fit.settings import FittingSettings
     from prefrl.fit.trainer import fit_judged
+    from prefrl.judgements import Comparison, Judged
     from prefrl.reward_models.mlp import MLPSettings
-    from prefrl.types import Comparison, Judged, Query, Segment
+    from prefrl.types import Query, Segment
 
     class Task:
         name, kind, segment_steps, action_bounds = "timed", "control", STEPS, None

@@ -34,12 +34,14 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from prefrl.config import Config
+from prefrl.exchange.formats import read_judgements
+from prefrl.exchange.layout import Which
 from prefrl.fit.metrics import accuracy
+from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.graph import batch
-from prefrl.label.formats import Which, read_judgements
-from prefrl.types import Comparison, Judged, Query, Ranking
+from prefrl.judgements import Comparison, Judged, Ranking
+from prefrl.types import Query
 
 HELD_OUT, WORDS = 0.25, 1024
 SETTINGS = {

@@ -19,7 +19,7 @@ import csv
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,12 @@ from scipy.optimize import isotonic_regression
 from prefrl.components import settings_class
 from prefrl.config import Config
 from prefrl.fit.trainer import fit_judged
-from prefrl.improve.rollout import cut, whole_episodes
+from prefrl.judgements import Comparison, Judged
+from prefrl.policies.rollout import whole_episodes
+from prefrl.sample.segments import cut
 from prefrl.seeding import streams
 from prefrl.store import Store
-from prefrl.types import Comparison, Judged, Query, gold_score
+from prefrl.types import Query, gold_score
 
 MEMBERS, CHOSEN, FIRST_SEED = 5, "information+k_medoids", 1
 HEADS = ("reward.train=head", "fitting.learning_rate=0.01", "fitting.epochs=30")
@@ -158,7 +160,9 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
             for name, count in (("pool", case.pool), ("test", case.tested)):
                 count //= config.loop.rounds + 1
                 episodes = max(2, 2 * count * task.segment_steps // task.horizon)
-                rollout = whole_episodes(task, lambda o: loop.learner.policy.act(o, rng), min(episodes, 100), rng)
+                rollout = whole_episodes(
+                    task, lambda o, legal: loop.learner.policy.act(o, rng, legal), min(episodes, 100), rng
+                )
                 parts.append(cut(rollout, task.segment_steps, count, f"{name} {stage.number}", rng))
             pool, tested = pool + parts[0], tested + parts[1]
     return pool, tested
@@ -166,19 +170,15 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
 
 def text(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
     """Responses of the starting policy, to prompts for learning and to prompts for evaluation."""
-    from prefrl.improve.generate import Sampling
-    from prefrl.improve.responses import respond
+    from prefrl.policies.language import LanguagePolicy
 
-    def respond_to(prompts: list[str], samples: int) -> list[Any]:
-        sampling = Sampling(samples, task.response_tokens, (int(task.tokenizer.eos_token_id),), 1.0)
-        drawn = respond(model, task, prompts, sampling, torch.Generator().manual_seed(samples))
-        found = drawn.candidates(task.tokenizer)
-        return [replace(r, gold=np.array([g])) for r, g in zip(found, task.gold(found), strict=True)]
-
-    model, rng = task.model(), np.random.default_rng(0)
-    return respond_to(task.prompts(case.pool // 4, rng), 4), respond_to(
-        task.evaluation_prompts(case.tested // 4, rng), 4
-    )
+    policy, rng = LanguagePolicy(task, temperature=1.0, part=64), np.random.default_rng(0)
+    drawn = [
+        policy.respond(prompts, 4, np.random.default_rng(4))
+        for prompts in (task.prompts(case.pool // 4, rng), task.evaluation_prompts(case.tested // 4, rng))
+    ]
+    pool, tested = map(policy.with_gold, drawn)
+    return pool, tested
 
 
 def curve(bench: Bench, selector: dict[str, Any], seed: int) -> Iterator[tuple[int, float]]:

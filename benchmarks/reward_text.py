@@ -188,9 +188,10 @@ def ours(folder: Path, precision: Any) -> None:
 
     from prefrl.fit.settings import FittingSettings
     from prefrl.fit.trainer import fit
+    from prefrl.judgements import Comparison
     from prefrl.reward_models.text import TransformerSettings
     from prefrl.store import Store
-    from prefrl.types import Comparison, Query, Response
+    from prefrl.types import Query, Response
 
     torch.set_num_threads(1)
     train, test = ([responses(row, Response) for row in rows] for rows in read_pairs(folder))

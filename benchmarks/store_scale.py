@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.label.server import api
-from prefrl.label.server.questions import Policy
-from prefrl.label.server.service import Service
-from prefrl.label.server.terms import Terms
-from prefrl.log import row
+from prefrl.judgements import Comparison
+from prefrl.page import api
+from prefrl.page.questions import Policy, Terms
+from prefrl.page.service import Service
+from prefrl.storage.log import row
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Response
+from prefrl.types import Query, Response
 
 PEOPLE = 50
 OVERLAP = 20

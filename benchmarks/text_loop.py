@@ -145,7 +145,7 @@ def ours(folder: Path) -> None:
     import torch
     from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
 
-    from prefrl.improve.text import TextSettings
+    from prefrl.improve.text import TextLearnerSettings
 
     torch.set_num_threads(1)
     words = PreTrainedTokenizerFast(tokenizer_file=str(folder / "words.json"))
@@ -159,7 +159,7 @@ def ours(folder: Path) -> None:
         prompts=lambda count, rng: prompts(next(rounds)),
     )
     reward: Any = SimpleNamespace(score=lambda found: np.array([reward_of(list(r.tokens)) for r in found], np.float32))
-    settings = TextSettings(
+    settings = TextLearnerSettings(
         updates=1, prompts=PROMPTS, responses=SAMPLES, beta=BETA, learning_rate=LEARNING_RATE, missing_end_penalty=0.0
     )
     store: Any = None

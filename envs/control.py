@@ -16,15 +16,22 @@ from gymnasium.wrappers import FlattenObservation
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings, missing, suggest
-from prefrl.envs.fast.classic import CartPole, Pendulum, Vectorised
+from prefrl.envs.fast.classic import CartPole, Pendulum
+from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.fast.wrapped import Wrapped, is_mujoco, make
-from prefrl.protocols import Environments
+from prefrl.protocols import Dynamics, Environments
 from prefrl.types import Floats, Segment
 
 SECONDS = 1.5
 """Default length of a segment: long enough to be judged, short enough to be judged at a glance."""
 STEPS_PER_SECOND = {"Pendulum-v1": 20.0, "CartPole-v0": 50.0, "CartPole-v1": 50.0}
 """Where `render_fps` is not the rate of the simulation, or is better not asked for."""
+WORLDS: dict[str, Callable[[bool], Dynamics]] = {
+    "Pendulum-v1": lambda terminate: Pendulum(),
+    "CartPole-v0": CartPole,
+    "CartPole-v1": CartPole,
+}
+"""Environments whose equations are here, by whether episodes may end early."""
 
 
 class ControlSettings(Settings):
@@ -75,6 +82,7 @@ class ControlSettings(Settings):
             probe = make(self.env, **options)
             accepted = inspect.signature(type(probe.unwrapped).__init__).parameters
             if "terminate_when_unhealthy" in accepted and not self.variable_horizon:
+                # An episode that ends early tells by its length how it was judged.
                 options["terminate_when_unhealthy"] = False
                 probe = make(self.env, **options)
         except ModuleNotFoundError as error:
@@ -142,10 +150,8 @@ def _environments(
     name: str, single: Callable[[], gymnasium.Env[Any, Any]], horizon: int, fixed_horizon: bool, count: int
 ) -> Environments:
     """The fastest stepper there is for an environment."""
-    if name == "Pendulum-v1":
-        return Vectorised(Pendulum(), count, horizon)
-    if name in ("CartPole-v0", "CartPole-v1"):
-        return Vectorised(CartPole(terminate=not fixed_horizon), count, horizon)
+    if name in WORLDS:
+        return Vectorised(WORLDS[name](not fixed_horizon), count, horizon)
     if name in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"):
         from prefrl.envs.fast.locomotion import Locomotion
 

@@ -32,7 +32,7 @@ class Rule:
 
     def draw(self, rng: np.random.Generator) -> tuple[str, ...]:
         at = bisect_right(self.cumulative, rng.random() * self.cumulative[-1])
-        return self.alternatives[min(at, len(self.alternatives) - 1)]
+        return self.alternatives[min(at, len(self.alternatives) - 1)]  # rounding can reach the total itself
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from prefrl.envs.fast.wrapped import make
+from prefrl.envs.pictures import BLUE, cartpole, finished, pendulum, stroke
 from prefrl.types import Floats, Segment
 
 INSTALL = "apt-get install -y libegl1 libgl1-mesa-dri"
-INK, RED, BLUE = (np.array(c, np.float32) for c in ((60, 66, 74), (201, 79, 69), (72, 120, 176)))
 
 
 def frames(name: str, segment: Segment, size: int) -> np.ndarray:
@@ -32,51 +32,20 @@ def frames(name: str, segment: Segment, size: int) -> np.ndarray:
     draw = {"Pendulum": _pendulum, "CartPole": _cartpole}.get(name.split("-")[0])
     if draw is None:
         return _mujoco(name, segment.states, size)
-    pictures = [draw(state, action, size) for state, action in zip(segment.states, segment.actions, strict=True)]
-    return np.rint(pictures).astype(np.uint8)
-
-
-# --- Classic control: lines with smooth edges, from each pixel's distance to them -----------------------------------
+    steps = zip(segment.states, segment.actions, strict=True)
+    return np.stack([finished(draw(state, action, size)) for state, action in steps])
 
 
 def _pendulum(state: Floats, action: Floats, size: int) -> Floats:
-    """A rod that hangs at angle pi and stands at 0; the bar below shows the torque, from its middle."""
-    angle, torque = state[0], np.clip(action[0] / 2.0, -1.0, 1.0)
-    picture = np.full((size, size, 3), 255.0, np.float32)
-    _stroke(picture, (0.0, 0.0), (-np.sin(angle), np.cos(angle)), 0.09, RED)
-    _stroke(picture, (0.0, 0.0), (0.0, 0.0), 0.04, INK)
-    _stroke(picture, (0.0, -1.3), (-torque, -1.3), 0.03, BLUE)
+    """The bar below shows the torque, from its middle."""
+    picture, torque = pendulum(state, size), np.clip(action[0] / 2.0, -1.0, 1.0)
+    stroke(picture, (0.0, -1.3), (-torque, -1.3), 0.03, BLUE)
     return picture
 
 
 def _cartpole(state: Floats, action: Floats, size: int) -> Floats:
-    """A cart on a track of 4.8 metres. Off it, the cart stays at the picture's edge."""
-    x, angle = float(np.clip(state[0] / 2.4, -1.25, 1.25)), state[2]
-    picture = np.full((size, size, 3), 255.0, np.float32)
-    _stroke(picture, (-1.0, -0.42), (1.0, -0.42), 0.012, INK)
-    _stroke(picture, (x - 0.12, -0.3), (x + 0.12, -0.3), 0.09, BLUE)
-    _stroke(picture, (x, -0.3), (x + 0.8 * np.sin(angle), -0.3 + 0.8 * np.cos(angle)), 0.045, RED)
-    return picture
-
-
-def _stroke(picture: Floats, begin: tuple[float, float], end: tuple[float, float], radius: float, ink: Floats) -> None:
-    """Draw a line with round ends on a picture that shows [-1.5, 1.5] in both directions, y upwards."""
-    size = len(picture)
-    pixel = 3.0 / size
-    rows, columns = (_span(begin[k] * sign, end[k] * sign, radius + pixel, size) for k, sign in ((1, -1.0), (0, 1.0)))
-    across = (np.arange(size, dtype=np.float32) + 0.5) * pixel - 1.5
-    dx, dy = across[None, columns] - begin[0], -across[rows, None] - begin[1]
-    along = end[0] - begin[0], end[1] - begin[1]
-    share = np.clip((dx * along[0] + dy * along[1]) / max(along[0] ** 2 + along[1] ** 2, 1e-12), 0.0, 1.0)
-    distance = np.hypot(dx - share * along[0], dy - share * along[1])
-    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]
-    picture[rows, columns] += cover * (ink - picture[rows, columns])
-
-
-def _span(a: float, b: float, margin: float, size: int) -> slice:
-    """The pixels between two coordinates, and `margin` beyond."""
-    low, high = ((x + 1.5) / 3.0 * size for x in (min(a, b) - margin, max(a, b) + margin))
-    return slice(max(0, int(low)), max(0, min(size, int(high) + 1)))
+    # The nearest point of the line, as a share of its length; the maximum is for a dot, which has none.
+    return cartpole(state, size)  # the edge fades over one pixel
 
 
 # --- MuJoCo -------------------------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
 from vaderSentiment.vaderSentiment import SentimentIntensityAnalyzer
 
 from prefrl.components import Settings
-from prefrl.envs.cloning import CloningSettings
 from prefrl.envs.grammar import Grammar
 from prefrl.envs.reviews import reviews, source
+from prefrl.policies.cloning import CloningSettings
 from prefrl.types import Floats, Response
 
 EVALUATION_SHARE = 8
@@ -36,7 +36,7 @@ class ReviewsSettings(Settings):
 
     def build(self) -> Reviews:
         grammar = reviews()
-        return Reviews(self, grammar, *self.cloning.build(grammar, source()))
+        return Reviews(self, grammar, *self.cloning.build(grammar.sample, source()))
 
 
 class Reviews:

@@ -6,14 +6,13 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 from transformers import (
     AutoModelForCausalLM,
-    AutoTokenizer,
     LlamaConfig,
     LlamaForCausalLM,
     PreTrainedModel,
@@ -21,9 +20,11 @@ from transformers import (
 )
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.cloning import make_tokenizer
 from prefrl.envs.text import for_evaluation
-from prefrl.label.formats import read_judgements
+from prefrl.exchange.formats import read_judgements
+from prefrl.kinds import only
+from prefrl.policies.cloning import make_tokenizer
+from prefrl.policies.pretrained import load_tokenizer, load_weights
 from prefrl.types import Floats, Response
 
 ONLY_BYTES = 259
@@ -58,9 +59,9 @@ class TextsSettings(Settings):
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
         model, tokenizer = _load(self.model) if self.model else _small(self)
         judged = read_judgements(self.prompts).judged if self.prompts else ()
-        if judged and not isinstance(judged[0].query.candidates[0], Response):
-            raise ConfigError(f"task.prompts: {self.prompts} holds segments; expected responses to prompts")
-        return Texts(self.response_tokens, tokenizer, model, tuple({j.query.candidates[0].context: 0 for j in judged}))
+        refusal = ConfigError(f"task.prompts: {self.prompts} holds segments; expected responses to prompts")
+        first = only(Response, [one.query.candidates[0] for one in judged], refusal)
+        return Texts(self.response_tokens, tokenizer, model, tuple({one.prompt: 0 for one in first}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +130,9 @@ def _load(folder: Path) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:
     if not folder.is_dir():
         raise ConfigError(f"task.model: {folder} is no folder; expected one that save_pretrained wrote")
     try:
-        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-        model = AutoModelForCausalLM.from_pretrained(
-            folder, dtype=torch.float32, local_files_only=True, use_safetensors=True
-        )
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"task.model: {folder} cannot be loaded: {error}") from error
+        model, tokenizer = load_weights(AutoModelForCausalLM, folder, False), load_tokenizer(folder, False)
+    except ConfigError as error:
+        raise ConfigError(f"task.model: {error}") from error
     if tokenizer.eos_token_id is None:
         raise ConfigError(f"task.model: the tokenizer in {folder} has no end token, so that no response could end")
-    model.eval()  # type: ignore[no-untyped-call]
-    return cast(PreTrainedModel, model), cast(PreTrainedTokenizerBase, tokenizer)
+    return model, tokenizer

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.fast.classic import Vectorised
+from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.protocols import Environments
-from prefrl.types import Floats, Segment
+from prefrl.types import Bools, Floats, Segment
 
 REACH = 1.5
 """How far from the middle the picture shows."""
@@ -26,12 +25,24 @@ class Point:
     def start(self, count: int, rng: np.random.Generator) -> Floats:
         return rng.uniform(-1.0, 1.0, (count, 2))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         following = np.clip(states + 0.1 * np.clip(actions, -1.0, 1.0), -REACH, REACH)
         return following, -np.linalg.norm(following, axis=1), np.zeros(len(states), bool)
 
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        """The point in blue, the middle in orange."""
+        axis = np.linspace(-REACH, REACH, size)
+        grid = np.stack(np.meshgrid(axis, -axis), -1)
+        picture = np.full((size, size, 3), 246, np.uint8)
+        picture[np.linalg.norm(grid, axis=-1) < 0.08] = MARK
+        picture[np.linalg.norm(grid - state, axis=-1) < 0.13] = INK
+        return picture
 
 
 class PointSettings(Settings):
@@ -74,13 +85,7 @@ class PointTask:
         return Vectorised(Point(), count, self.horizon)
 
     def frames(self, segment: Segment) -> np.ndarray:
-        """The point in blue, the middle in orange."""
+        """(T, frame_size, frame_size, 3). Raises `ValueError` where the segment keeps no states."""
         if segment.states is None:
             raise ValueError("a segment can only be drawn from its simulator states, and this one has none")
-        axis = np.linspace(-REACH, REACH, self.frame_size)
-        grid = np.stack(np.meshgrid(axis, -axis), -1)
-        pictures = np.full((len(segment), self.frame_size, self.frame_size, 3), 246, np.uint8)
-        pictures[:, np.linalg.norm(grid, axis=-1) < 0.08] = MARK
-        away = np.linalg.norm(grid[None] - segment.states[:, None, None, :2], axis=-1)
-        pictures[away < 0.13] = INK
-        return pictures
+        return np.stack([Point().picture(state, self.frame_size) for state in segment.states])

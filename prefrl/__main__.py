@@ -1,6 +1,6 @@
 """`python -m prefrl` is the command line."""
 
-from prefrl.cli import main
+from prefrl.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict
 
@@ -30,9 +30,21 @@ class Settings(BaseModel):
         """The same with as little work as still makes sense: for dry runs and tests."""
         return self
 
+    def with_evaluation_of(self, other: Self) -> Self:
+        """The same, evaluated on as much as another learner's settings say; for a learner that can be shrunk."""
+        return self
+
     def lasting(self) -> Self:
         """The same without what may change from one start of a run to the next, such as a port."""
         return self
+
+    def asks_people(self) -> bool:
+        """Whether a labeler speaks to people, and so needs the terminal for itself."""
+        return False
+
+    def formula(self) -> str:
+        """What a learner optimises, in plain letters; empty where there is nothing to spell out."""
+        return ""
 
     def work(self) -> float:
         """How much a round takes, in any unit: a dry run compares it with that of the shrunk settings."""
@@ -62,9 +74,10 @@ TABLE: dict[Role, dict[str, str]] = {
         "transformer": "prefrl.reward_models.text:TransformerSettings",
     },
     "learners": {
-        "ppo": "prefrl.improve.control:PPOSettings",
+        "control": "prefrl.improve.control:ControlLearnerSettings",
+        "dpo": "prefrl.improve.dpo:DPOSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
-        "text": "prefrl.improve.text:TextSettings",
+        "text": "prefrl.improve.text:TextLearnerSettings",
     },
     "selectors": {
         "uniform": "prefrl.sample.select:UnscoredSettings",
@@ -74,6 +87,8 @@ TABLE: dict[Role, dict[str, str]] = {
         "information": "prefrl.sample.select:ScoredSettings",
     },
 }
+RENAMED: dict[Role, dict[str, str]] = {"learners": {"ppo": "control"}}
+"""Kinds that had another name before: role -> old name -> today's."""
 EXTRAS = {
     "gymnasium": "control",
     "mujoco": "control",
@@ -90,6 +105,13 @@ EXTRAS = {
     "pyarrow": "interchange",
     "minari": "interchange",
 }
+
+
+def filled_in(given: Any, defaults: dict[str, dict[str, Any]]) -> Any:
+    """Settings with the defaults of their `algorithm`, the first one unless given; what is given stands."""
+    if not isinstance(given, dict):
+        return given
+    return defaults.get(given.get("algorithm", next(iter(defaults))), {}) | given
 
 
 @cache
@@ -110,6 +132,8 @@ def kinds(role: Role) -> list[str]:
 
 def settings_class(role: Role, kind: str) -> type[Settings]:
     """The settings class behind a kind; loads its module. Raises `ConfigError` with the nearest name."""
+    if kind not in kinds(role) and kind in RENAMED.get(role, {}):
+        raise ConfigError(f"{role[:-1]} kind {kind!r} is now called {RENAMED[role][kind]!r}")
     if kind not in kinds(role):
         raise ConfigError(f"unknown {role[:-1]} kind {kind!r}; {suggest(kind, kinds(role))}")
     try:

@@ -7,18 +7,31 @@ from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
-from prefrl.fit.descent import trainable
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
-from prefrl.seeding import streams
-from prefrl.store import Store
+from prefrl.protocols import (
+    Labeler,
+    LabelerSettings,
+    Learner,
+    LearnerSettings,
+    RewardModel,
+    RewardSettings,
+    SelectorSettings,
+    Task,
+    TaskSettings,
+)
+from prefrl.seeding import device_of, streams
+
+if TYPE_CHECKING:
+    from prefrl.store import Store
 
 
 def _component(role: Role, default: str | None, value: object) -> Settings:
@@ -63,6 +76,11 @@ class Config(Settings):
     seed: int = Field(0, ge=0)
     """All random numbers of the run come from this one."""
 
+    @property
+    def discount(self) -> float:
+        """The learner's own."""
+        return cast(LearnerSettings, self.learner).discount
+
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:
         """Read a preset ("control/pendulum") or a YAML file, with `dotted.key=value` overrides.
@@ -89,23 +107,47 @@ class Config(Settings):
 
     def build(self, store: Store[Any]) -> Loop[Any]:
         """Make every component, and the loop that joins them, on an open store."""
-        rng = streams(self.seed, 0).build
-        parts: Any = self  # the settings classes are known by kind only
-        task = parts.task.build()
-        learner, reward = parts.learner.build(task, rng), parts.reward.build(task, rng)
-        check_settings(self.fitting, not trainable(reward), task.kind, parts.select.candidates)
+        from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
+
+        rng, select = streams(self.seed, 0).build, cast(SelectorSettings, self.select)
+        task = self.build_task()
+        learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
+        check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         return Loop(
             task=task,
             learner=learner,
             reward=reward,
-            labeler=parts.labeler.build(task),
-            selector=parts.select.build(),
+            labeler=self.build_labeler(task),
+            selector=select.build(),
             store=store,
-            candidates=parts.select.candidates,
+            candidates=select.candidates,
             fitting=self.fitting,
             settings=self.loop,
             seed=self.seed,
         )
+
+    # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.
+
+    def build_task(self) -> Task:
+        return cast(TaskSettings, self.task).build()
+
+    def build_labeler(self, task: Task) -> Labeler[Any]:
+        return cast(LabelerSettings, self.labeler).build(task)
+
+    def build_reward(self, task: Task, rng: np.random.Generator) -> RewardModel[Any]:
+        """Not fitted yet, on the learner's device."""
+        model = cast(RewardSettings, self.reward).build(task, rng)
+        model.to(device_of(cast(LearnerSettings, self.learner).device))
+        return model
+
+    def build_learner(self, task: Task, rng: np.random.Generator) -> Learner[Any]:
+        """Raises `ConfigError` for a learner of another package that does not say its discount and device."""
+        if not isinstance(self.learner, LearnerSettings):
+            raise ConfigError(
+                f"learner: {type(self.learner).__name__} has no `discount`, which the report card reads, or no "
+                "`device`, which the reward model shares"
+            )
+        return self.learner.build(task, rng)
 
 
 def presets() -> dict[str, str]:

@@ -15,7 +15,6 @@ from pydantic import Field
 
 from prefrl.components import Settings
 from prefrl.fit.settings import FittingSettings
-from prefrl.fit.trainer import NothingToFit, fit
 from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
 from prefrl.seeding import Streams, streams
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
@@ -88,6 +87,7 @@ class Loop(Generic[C]):
         """One turn of the loop: the five stages, in order."""
         number = self.round + 1
         rng = streams(self.seed, number)
+        # A difference of rounded sums: over all rounds exactly `labels` are asked.
         pool = self.ask(self.settings.asked_by(number) - self.settings.asked_by(number - 1), rng)
         with self._timed("label"):
             self.labeler.answer(self.store, rng.label)
@@ -124,6 +124,7 @@ class Loop(Generic[C]):
 
     def _new(self, queries: list[Query[C]], pool: list[C], count: int, rng: Streams) -> list[Query[C]]:
         """Without those that were asked in rounds before: a policy may repeat itself. Others of the pool stand in."""
+        # Up to the last finished round: one that was killed and is done again finds its own queries, and may ask them.
         known = self.store.asked_before([query.id for query in queries], self.sequence)
         if not known:
             return queries
@@ -135,6 +136,8 @@ class Loop(Generic[C]):
         )
 
     def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
+        from prefrl.fit.trainer import NothingToFit, fit  # torch is heavy, and who reads settings needs none
+
         with self._timed("fit"):
             try:
                 fitted = fit(self.reward, self.store, self.fitting, rng.fit, pool)

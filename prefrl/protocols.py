@@ -6,24 +6,15 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
-from prefrl.types import (
-    Answer,
-    C,
-    C_contra,
-    Evaluation,
-    Floats,
-    Judged,
-    Metrics,
-    Query,
-    Response,
-    Segment,
-    State,
-    Steps,
-)
+from prefrl.components import ConfigError
+from prefrl.judgements import Answer, Judged
+from prefrl.kinds import RESPONSES, SEGMENTS
+from prefrl.seeding import Device
+from prefrl.types import Bools, C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
 
 if TYPE_CHECKING:
     import torch
@@ -39,7 +30,18 @@ class Task(Protocol):
 
     @property
     def kind(self) -> str:
-        """ "control" or "text"."""
+        """The name of the kind of its candidates, see `prefrl.kinds`."""
+
+
+class DrawnTask(Task, Protocol[C_contra]):
+    """A task whose candidates are shown as clips."""
+
+    @property
+    def fps(self) -> float:
+        """Pictures of a clip per second."""
+
+    def frames(self, candidate: C_contra, /) -> np.ndarray:
+        """(T, H, W, 3) uint8 pictures of a candidate."""
 
 
 class Transition(NamedTuple):
@@ -57,6 +59,38 @@ class Transition(NamedTuple):
     """(n, O): what this step led to, before any reset."""
 
 
+class TaskSettings(Protocol):
+    """What chooses a task."""
+
+    def build(self) -> Task: ...
+
+
+class Dynamics(Protocol):
+    """A world as a value: pure functions of states that are rows of an array, n of them side by side.
+
+    `prefrl.envs.fast.vectorised.Vectorised` makes `Environments` of it.
+    """
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        """(n, S) float64 first states."""
+
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
+        """States (n, S) and actions (n, A) -> new arrays: next states (n, S), rewards (n,), terminated (n,).
+
+        Chance in a step is drawn from `rng`, for all n at once.
+        """
+
+    def observe(self, states: Floats) -> Floats:
+        """(n, S) -> (n, O) float32."""
+
+    def legal(self, states: Floats) -> Bools | None:
+        """(n, A): which of the discrete actions there are in each state, at least one; None in every state where all
+        always are."""
+
+    def picture(self, state: Floats, size: int) -> np.ndarray | None:
+        """(size, size, 3) uint8 of a state (S,), or None where there is nothing to see."""
+
+
 class Environments(Protocol):
     """n environments stepped together. An episode that ends is reset in the same step."""
 
@@ -68,6 +102,9 @@ class Environments(Protocol):
 
     def states(self) -> Floats | None:
         """(n, S) float64 simulator states, enough to draw each environment as it stands, or None."""
+
+    def legal(self) -> Bools | None:
+        """(n, A): which discrete actions each environment allows now; None, always, where all are allowed."""
 
 
 class ControlTask(Task, Protocol):
@@ -126,6 +163,20 @@ class TextTask(Task, Protocol):
         """(N,) 1 where a response is well formed, else 0; None where the task cannot tell."""
 
 
+def control(task: Task, what: str) -> ControlTask:
+    """A task, known to be of control. Raises `ConfigError` for others; `what` says who needs it and for what."""
+    if task.kind != SEGMENTS.name:
+        raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
+    return cast(ControlTask, task)
+
+
+def text(task: Task, what: str) -> TextTask:
+    """A task, known to be of text, as `control` is for its own."""
+    if task.kind != RESPONSES.name:
+        raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
+    return cast(TextTask, task)
+
+
 class Labeler(Protocol[C]):
     """Who answers."""
 
@@ -134,6 +185,12 @@ class Labeler(Protocol[C]):
 
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
         """Answer open queries of the store: all of them now (an oracle), or as far as people have come."""
+
+
+class LabelerSettings(Protocol):
+    """What chooses a labeler."""
+
+    def build(self, task: Any) -> Labeler[Any]: ...
 
 
 @runtime_checkable
@@ -150,30 +207,34 @@ class Attended(Protocol):
         """Close it, before the store is closed. Does nothing where it is not open."""
 
 
-class Store(Protocol[C]):
+class Judgements(Protocol[C]):
+    """What was judged, to be read: by fits and report cards. A store is one, and so is a file."""
+
+    @property
+    def sequence(self) -> int:
+        """The number of the newest event: the snapshot that a fit is made on."""
+
+    def judged(self, upto: int | None = None) -> list[Judged[C]]:
+        """Queries with their judgements, in the order in which they were given, up to a sequence number."""
+
+    def open_queries(self, labeler: str = "") -> list[Query[C]]:
+        """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
+
+    def gold(self, candidates: Sequence[C]) -> list[Floats]:
+        """The hidden values of candidates: for oracles and evaluation only."""
+
+
+class Store(Judgements[C], Protocol[C]):
     """Every behaviour asked about and every answer given, append-only."""
 
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
-
-    def open_queries(self, labeler: str = "") -> list[Query[C]]:
-        """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
 
     def answer(self, answers: Sequence[Answer]) -> None:
         """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""
-
-    def judged(self, upto: int | None = None) -> list[Judged[C]]:
-        """Queries with their judgements, in the order in which they were given, up to a sequence number."""
-
-    def gold(self, candidates: Sequence[C]) -> list[Floats]:
-        """The hidden values of candidates: for oracles and evaluation only."""
-
-    @property
-    def sequence(self) -> int:
-        """The number of the newest event: the snapshot that a fit is made on."""
 
     def counts(self) -> dict[str, int]:
         """Queries asked, answered, skipped."""
@@ -205,6 +266,9 @@ class RewardModel(Protocol[C_contra]):
 
     def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 
+    def to(self, device: torch.device) -> None:
+        """Move everything to a device, once, before it is fitted or loaded: what is stacked lies there from then on."""
+
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """End a fit: freeze each member's shift and scale so that rewards have mean 0 and std 1 on these candidates.
 
@@ -232,6 +296,12 @@ class RewardModel(Protocol[C_contra]):
     def load(self, state: State) -> None: ...
 
 
+class RewardSettings(Protocol):
+    """What chooses a reward model."""
+
+    def build(self, task: Any, rng: np.random.Generator) -> RewardModel[Any]: ...
+
+
 @runtime_checkable
 class StepRewardModel(RewardModel[Segment], Protocol):
     """A reward model for control: a segment's score is the sum of its steps' rewards."""
@@ -246,6 +316,53 @@ class StepRewardModel(RewardModel[Segment], Protocol):
     @property
     def memory(self) -> int:
         """How many steps a reward looks at: 1 where it hangs on its own step alone."""
+
+
+class Inputs(Protocol):
+    """What a policy reads of B sequences of at most L steps: tokens of responses, or decisions and what was seen."""
+
+    @property
+    def mask(self) -> torch.Tensor:
+        """(B, L) bool: the real steps."""
+
+    def rows(self, at: torch.Tensor) -> Self:
+        """Some sequences, cut to the longest of them."""
+
+    def lengths(self) -> torch.Tensor:
+        """(B,) how much each sequence costs to go through, context included."""
+
+
+I = TypeVar("I", bound=Inputs)  # noqa: E741
+I_contra = TypeVar("I_contra", bound=Inputs, contravariant=True)
+
+
+class Policy(Protocol[I_contra]):
+    """What a policy gradient improves: it can say how probable its choices were."""
+
+    def parameters(self) -> Iterable[torch.nn.Parameter]:
+        """Everything that learns, the critic included."""
+
+    def log_prob(self, inputs: I_contra) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """(B, L) log-probabilities of what was chosen, differentiable, and (B, L) entropies in nats where they come
+        cheap; 0 on padding."""
+
+    def values(self, inputs: I_contra) -> torch.Tensor:
+        """(B, L) what the critic expects from each step on. Raises `ValueError` where there is no critic."""
+
+
+@runtime_checkable
+class LearnerSettings(Protocol):
+    """What chooses a learner."""
+
+    @property
+    def device(self) -> Device:
+        """Where its policy computes; the reward model goes there too."""
+
+    @property
+    def discount(self) -> float:
+        """What a reward a step later counts for in learning; 1 where candidates are scored as a whole."""
+
+    def build(self, task: Any, rng: np.random.Generator) -> Learner[Any]: ...
 
 
 class Learner(Protocol[C]):
@@ -276,17 +393,36 @@ class Selector(Protocol[C]):
         """At most `count` queries over candidates of the pool."""
 
 
+class SelectorSettings(Protocol):
+    """What chooses a selector."""
+
+    @property
+    def candidates(self) -> int:
+        """How many there are in a query."""
+
+    def build(self) -> Selector[Any]: ...
+
+
 __all__ = [
     "Attended",
     "ControlTask",
+    "Dynamics",
     "Environments",
+    "Inputs",
+    "Judgements",
     "Labeler",
+    "LabelerSettings",
     "Learner",
+    "LearnerSettings",
+    "Policy",
     "RewardModel",
+    "RewardSettings",
     "Selector",
+    "SelectorSettings",
     "StepRewardModel",
     "Store",
     "Task",
+    "TaskSettings",
     "TextTask",
     "Transition",
 ]

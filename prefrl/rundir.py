@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.checkpoints import load_state, save_state
 from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.drift import first_judged, read_probes
-from prefrl.evaluate.examples import save_examples
-from prefrl.evaluate.report import write_report
+from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
-from prefrl.files import MANIFEST, DamagedError, verify, whole_folder, write_file
-from prefrl.grading import discount_of, grade, of_run
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, RewardModel, Task
+from prefrl.report.examples import save_examples
+from prefrl.report.report import write_report
 from prefrl.seeding import streams
+from prefrl.storage.checkpoints import load_state, save_state
+from prefrl.storage.files import MANIFEST, DamagedError, verify, whole_folder, write_file
 from prefrl.store import Store
 from prefrl.types import Fitted, Round
 
@@ -61,7 +61,7 @@ class Run:
             self._events = _events(self.folder, self.loop.round)
             if isinstance(self.loop.labeler, Attended):
                 self.notes += self.loop.labeler.open(self.store)
-        except BaseException:
+        except BaseException:  # Ctrl-C too: a folder must not stay owned by a start that failed
             self.store.close()
             raise
 
@@ -78,6 +78,7 @@ class Run:
 
     def close(self) -> None:
         """Let go of the folder; people can answer until then."""
+        # The page before the store: its last answers are still to be written.
         if isinstance(self.loop.labeler, Attended):
             self.loop.labeler.close()
         self._events.close()
@@ -95,11 +96,10 @@ class Run:
 
     def report(self) -> Path:
         """Grade the reward model where judgements were held out, write `report.html`, and say where it is."""
-        settings = self.config
-        reward, discount = self.loop.reward, discount_of(settings.learner)
-        subject = of_run(reward, self.store, self.folder, self.loop.round, settings.fitting, discount)
+        config, loop = self.config, self.loop
+        subject = of_run(loop.reward, self.store, self.folder, loop.round, config.fitting, config.discount)
         if subject is not None:
-            card = grade(subject, streams(settings.seed, 0).evaluate)
+            card = grade(subject, streams(config.seed, 0).evaluate)
             write_file(self.folder / "card.json", card.model_dump_json(indent=1).encode())
         return write_report(self.folder)
 
@@ -125,6 +125,7 @@ class Run:
         """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""
         row = {"round": round.number} | {k: v if math.isfinite(v) else None for k, v in round.metrics.items()}
         self._rows.append(row)
+        # Whole each time, not appended to: a kill leaves the old file or the new one, and no half line.
         write_file(self.folder / "metrics.jsonl", "".join(json.dumps(r) + "\n" for r in self._rows).encode())
         write_file(self.folder / "summary.json", json.dumps(self.summary, indent=1).encode())
         if round.fitted is not None and len(round.fitted.predicted):
@@ -158,7 +159,7 @@ class Run:
             save_state(folder, "reward", self.loop.reward.state())
             write_file(folder / "config.yaml", self.config.dump().encode())
             write_file(folder / "loop.json", json.dumps({"round": number, "store": self.loop.sequence}).encode())
-        for old in _checkpoints(self.folder)[KEEP:]:
+        for old in _checkpoints(self.folder)[KEEP:]:  # only once the new one stands
             shutil.rmtree(old)
 
     def _restore(self) -> list[dict[str, Any]]:
@@ -166,7 +167,7 @@ class Run:
 
         Labels that came after that checkpoint stay in the store, and count from the next fit on.
         """
-        for unfinished in (self.folder / "checkpoints").glob(".round-*"):
+        for unfinished in (self.folder / "checkpoints").glob(".round-*"):  # what a kill left of a checkpoint
             shutil.rmtree(unfinished)
         if not _checkpoints(self.folder):
             return []
@@ -177,6 +178,7 @@ class Run:
         found = json.loads((folder / "loop.json").read_text())
         self.loop.round, self.loop.sequence = found["round"], found["store"]
         self.notes.append(f"going on after round {self.loop.round}")
+        # A later row belongs to a round whose checkpoint is missing: it is done again.
         return [row for row in read_metrics(self.folder) if row["round"] <= self.loop.round]
 
 
@@ -190,8 +192,7 @@ class Saved:
 
     def reward(self, task: Task) -> RewardModel[Any]:
         """The reward model, on a task of the same kind."""
-        settings: Any = self.config.reward
-        model: RewardModel[Any] = settings.build(task, streams(self.config.seed, 0).build)
+        model = self.config.build_reward(task, streams(self.config.seed, 0).build)
         model.load(load_state(self.folder, "reward"))
         return model
 
@@ -240,7 +241,7 @@ def _claim(config: Config, folder: Path, store: Store[Any]) -> None:
     if _lasting(found) != _lasting(config):
         difference = _difference(_lasting(found), _lasting(config))
         raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")
-    write_file(path, config.dump().encode())
+    write_file(path, config.dump().encode())  # what may differ from start to start, a port say, is kept as it is now
 
 
 def _lasting(config: Config) -> Config:
@@ -292,4 +293,4 @@ def _events(folder: Path, round: int) -> Any:
     """TensorBoard's event files, beside the rest."""
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder), purge_step=round + 1)
+    return SummaryWriter(str(folder), purge_step=round + 1)  # drops what it holds of rounds that are done again

@@ -1,15 +1,24 @@
-"""One seed -> independent streams of random numbers, one for each stage of each round.
+"""One seed -> independent streams of random numbers, one for each stage of each round; and the device to compute on.
 
 A stream is a function of (seed, round, stage) alone, so a resumed run draws what an unbroken one would have
-drawn, and no generator's state has to be saved.
+drawn, and no generator's state has to be saved. All numbers are drawn on the CPU, then moved: a seed means the same
+starting weights and the same draws on every device.
 """
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:  # torch is heavy, and who reads settings needs none
+    import torch
+
+Device: TypeAlias = Literal["auto", "cpu", "cuda"]
+"""Where tensors are made; `auto` is the GPU where there is one."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +37,7 @@ class Streams:
 
 def streams(seed: int, round: int) -> Streams:
     """The streams of a round (0 is before the first)."""
+    # By place: a new stage belongs at the end, or every stage after it would draw other numbers.
     keys = {f.name: (0 if f.name == "evaluate" else round, i) for i, f in enumerate(fields(Streams))}
     return Streams(
         **{name: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=k)) for name, k in keys.items()}
@@ -36,9 +46,35 @@ def streams(seed: int, round: int) -> Streams:
 
 def keyed(base: int, key: str) -> np.random.Generator:
     """A generator for one named thing (a query, say): the same whatever was drawn before it."""
+    # Not Python's hash(), which differs from one process to the next.
     return np.random.default_rng([base, int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "big")])
 
 
 def draw_seed(rng: np.random.Generator) -> int:
     """A seed for a library that keeps its own generator (torch, gymnasium)."""
     return int(rng.integers(2**31 - 1))
+
+
+def generator(rng: np.random.Generator) -> torch.Generator:
+    """A generator of torch's for drawing on the CPU, seeded from `rng`."""
+    import torch
+
+    return torch.Generator("cpu").manual_seed(draw_seed(rng))
+
+
+def device_of(name: Device) -> torch.device:
+    """The device that a setting names. Raises `ValueError` for a GPU that torch cannot find."""
+    import torch
+
+    found = torch.cuda.is_available()
+    if name == "cuda" and not found:
+        raise ValueError(
+            "learner.device=cuda, but torch finds no GPU: set it to auto or cpu, or install a torch with CUDA"
+        )
+    return torch.device(("cuda" if found else "cpu") if name == "auto" else name)
+
+
+def to_numpy(tensor: torch.Tensor) -> npt.NDArray[Any]:
+    """A tensor of any device as an array; of one on the CPU it is a view."""
+    found: npt.NDArray[Any] = tensor.detach().cpu().numpy()
+    return found

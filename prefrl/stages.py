@@ -12,21 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.checkpoints import load_state
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
-from prefrl.evaluate.report import render_card
+from prefrl.evaluate.grade import Subject, grade, habits, judgements, of_run
 from prefrl.evaluate.summary import read_metrics
-from prefrl.files import check_free, read_lines, write_file
+from prefrl.exchange.layout import Which
+from prefrl.exchange.source import open_judgements
+from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
-from prefrl.grading import Subject, discount_of, grade, habits, judgements, of_run
-from prefrl.graph import batch
-from prefrl.label.formats import Which
-from prefrl.label.source import open_judgements
-from prefrl.protocols import Attended
+from prefrl.kinds import only
+from prefrl.protocols import Attended, Labeler, text
+from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
+from prefrl.storage.checkpoints import load_state
+from prefrl.storage.files import check_free, read_lines, write_file
 from prefrl.store import Store
 from prefrl.types import Evaluation, Fitted, Query, Response
 
@@ -74,16 +75,16 @@ def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: No
     if not (folder / "store.db").exists() and not (folder / "store.url").exists():
         raise RunError(f"{folder} holds no store: expected the folder of a run, or of `prefrl label`")
     saved_config(folder)  # says what is missing, if it is
-    settings: Any = Config.load(folder / "config.yaml", ["labeler.kind=web", *overrides])
+    config = Config.load(folder / "config.yaml", ["labeler.kind=web", *overrides])
     with Store[Any](folder) as store:
-        labeler = settings.labeler.build(settings.task.build())
+        labeler = config.build_labeler(config.build_task())
         with attended(labeler, store, tell):
-            labeler.answer(store, streams(settings.seed, 1).label)
+            labeler.answer(store, streams(config.seed, 1).label)
         return store.counts()
 
 
 @contextmanager
-def attended(labeler: Any, store: Store[Any], tell: Tell) -> Iterator[None]:
+def attended(labeler: Labeler[Any], store: Store[Any], tell: Tell) -> Iterator[None]:
     """Have open what a labeler's people come to, if there is such a thing; nothing more will be asked."""
     if not isinstance(labeler, Attended):
         yield
@@ -98,8 +99,7 @@ def attended(labeler: Any, store: Store[Any], tell: Tell) -> Iterator[None]:
 
 def read_queries(path: Path, task: Any) -> list[Query[Response]]:
     """Queries from JSON lines `{"prompt": ..., "responses": [...]}`. Raises `ValueError` with the row's number."""
-    if task.kind != "text":
-        raise ValueError(f"{path} holds responses to prompts, but {task.name} is no text task")
+    text(task, f"{path} holds responses to prompts")
     queries = []
     for number, line in enumerate(read_lines(path), 1):
         try:
@@ -144,14 +144,13 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
     Returns what the fit came to, and notes for people on what was left out of a file.
     """
     check_free(out)
-    settings: Any = config
-    rng, task = streams(config.seed, 1), settings.task.build()
+    rng, task = streams(config.seed, 1), config.build_task()
     with open_judgements(source, task, which) as (store, notes):
         if config.fitting.pseudo_labels and not store.open_queries():
             raise ConfigError(
                 f"fitting.pseudo_labels: {source} holds no query without a judgement to label; set it to 0"
             )
-        reward = settings.reward.build(task, rng.build)
+        reward = config.build_reward(task, rng.build)
         fitted = fit(reward, store, config.fitting, rng.fit)
     save_reward(out, config, reward, fitted)
     return fitted, notes
@@ -163,12 +162,11 @@ def export_classifier(saved: Path, to: Path) -> float:
     from prefrl.reward_models.text import TransformerReward
 
     found = open_saved(saved)
-    settings: Any = found.config
     check_free(to)
-    reward = found.reward(settings.task.build())
+    reward = found.reward(found.config.build_task())
     if not isinstance(reward, TransformerReward):
-        raise RunError(f"{saved} holds a reward of kind {settings.reward.kind!r}: only 'transformer' is a classifier")
-    return save_classifier(reward, to)
+        raise RunError(f"{saved} holds a {type(reward).__name__}: only a reward of kind 'transformer' is a classifier")
+    return save_classifier(reward.backbone, *reward.mean_head(), to)
 
 
 def with_reward(config: Config, saved: Path) -> Config:
@@ -180,9 +178,8 @@ def with_reward(config: Config, saved: Path) -> Config:
 def evaluate(folder: Path) -> Evaluation[Any]:
     """Evaluate the newest policy of a run, with its reward model."""
     saved = open_saved(folder)
-    settings: Any = saved.config
-    task = settings.task.build()
-    learner = settings.learner.build(task, streams(saved.config.seed, 0).build)
+    task = saved.config.build_task()
+    learner = saved.config.build_learner(task, streams(saved.config.seed, 0).build)
     try:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
@@ -204,9 +201,9 @@ def report_card(
     the scores of text pairs. Raises `RunError` where there is nothing to grade on.
     """
     saved = open_saved(model)
-    settings: Any = saved.config
-    task, fitting, rng = settings.task.build(), settings.fitting, streams(settings.seed, 0).evaluate
-    reward, discount = saved.reward(task), discount_of(settings.learner)
+    task, fitting = saved.config.build_task(), saved.config.fitting
+    rng = streams(saved.config.seed, 0).evaluate
+    reward, discount = saved.reward(task), saved.config.discount
     source = data or model
     if data is None and not (model / "checkpoints").exists():
         raise RunError(f"{model} holds no judgements: say what to grade it on, with --data FOLDER_OR_FILE")
@@ -236,19 +233,21 @@ def _fits(model: Path) -> list[dict[str, Any]]:
 
 def _write_rewardbench(subject: Subject, folder: Path) -> None:
     """Every pair in which one response is preferred, with the scores of both."""
-    from prefrl.reward_models.io import ScoredPair, write_rewardbench
+    from prefrl.exchange.rewardbench import ScoredPair, write_rewardbench
+    from prefrl.reward_models.text import TransformerReward
 
     pairs, rows = batch(subject.judged), []
-    if not all(isinstance(c, Response) for c in pairs.candidates):
-        raise RunError("RewardBench knows pairs of texts: segments of control cannot be written for it")
+    refusal = RunError("RewardBench knows pairs of texts: segments of control cannot be written for it")
+    responses = only(Response, pairs.candidates, refusal)
     scores = subject.reward.score(pairs.candidates)
     for number, ((first, second), preference) in enumerate(zip(pairs.edges, pairs.preference, strict=True)):
         best, worst = (first, second) if preference > 0.5 else (second, first)
-        chosen, rejected = (pairs.candidates[i].prompt + pairs.candidates[i].text for i in (best, worst))
+        chosen, rejected = (responses[i].prompt + responses[i].text for i in (best, worst))
         if preference != 0.5:
             rows.append(ScoredPair(number, subject.data, chosen, rejected, float(scores[best]), float(scores[worst])))
-    backbone = getattr(subject.reward, "backbone", None)  # a reward model of another make has none
-    write_rewardbench(folder, subject.model, rows, chat=bool(backbone and backbone.chat))
+    reward = subject.reward  # a reward model of another make knows no chat template
+    chat = isinstance(reward, TransformerReward) and reward.backbone.chat
+    write_rewardbench(folder, subject.model, rows, chat)
 
 
 def write_card(card: ReportCard, data: Path | None, page: Path | None) -> None:
@@ -270,9 +269,9 @@ def estimate(config: Config) -> float:
 
     Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
     """
-    true_size = {name: value for name, value in config.learner if name.startswith("evaluation_")}
-    small = shrink(config).model_copy(update={"task": config.task})
-    small = small.model_copy(update={"learner": small.learner.model_copy(update=true_size)})
+    small = shrink(config)
+    learner = small.learner.with_evaluation_of(config.learner)
+    small = small.model_copy(update={"task": config.task, "learner": learner})
     with tempfile.TemporaryDirectory() as scratch, Store[Any](Path(scratch)) as store:
         loop = small.build(store)
         start, one = (round.metrics for round in loop.run())

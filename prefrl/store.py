@@ -9,21 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic
 
 import sqlalchemy as sql
 
-from prefrl.arrivals import Merged, check_arrivals
-from prefrl.blobs import read_arrays, write_arrays
-from prefrl.events import ANSWER_TYPES, describe, load_candidate, read_answer
-from prefrl.log import EventLog, StoreError, Transaction, row
-from prefrl.projection import ANSWERS, CHUNK, JUDGEMENTS, chunks, words
-from prefrl.tables import event, standing
-from prefrl.tables import query as asked
-from prefrl.types import Answer, C, Candidate, Floats, Judged, Query, Segment, Skip, check_fits
+from prefrl.judgements import Answer, Judged, check_fits
+from prefrl.storage.arrivals import Merged, check_arrivals
+from prefrl.storage.blobs import read_arrays, write_arrays
+from prefrl.storage.events import answer_body, answer_kind, describe, load_candidate, read_answer, write_candidate
+from prefrl.storage.log import EventLog, StoreError, Transaction, row
+from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, bodies, chunks, words
+from prefrl.storage.tables import event, standing
+from prefrl.storage.tables import query as asked
+from prefrl.types import C, Candidate, Floats, Query
 
 WRITERS = 16
 """Files written at once."""
@@ -65,6 +65,7 @@ class Store(Generic[C]):
         """
         candidates = {c.id: c for query in queries for c in query.candidates}
         self._check_kind(candidates.values())
+        # Files before events: what the log names must be there, and a file that it does not name does no harm.
         self._file(candidates.values())
         more: list[dict[str, Any]] = [{} for _ in queries]
         if purpose != "label":
@@ -90,11 +91,10 @@ class Store(Generic[C]):
             if answer.query not in sizes:
                 raise StoreError(f"an answer to query {answer.query[:12]}, which was never asked")
             _check_size(answer, sizes[answer.query])
-            kind = next(k for k, cls in ANSWER_TYPES.items() if isinstance(answer, cls))
-            body = {k: v for k, v in asdict(answer).items() if k not in ("query", "labeler")}
+            body = answer_body(answer) | ({"about": about} if about else {})
             revision = there.get((answer.query, answer.labeler), {"revision": 0})["revision"]
             id = f"{answer.query}:{answer.labeler}:{revision}"
-            rows.append(row(id, kind, answer.query, answer.labeler, body | ({"about": about} if about else {})))
+            rows.append(row(id, answer_kind(answer), answer.query, answer.labeler, body))
         return tx.extend(rows)
 
     def put(self, tx: Transaction, answer: Answer, about: dict[str, Any]) -> int:
@@ -132,7 +132,7 @@ class Store(Generic[C]):
         self._file_one(load_candidate(one["id"], one["body"], blobs))
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
-        """A store holds segments or responses, not both: a learner could make nothing of the others."""
+        """A store holds candidates of one kind: a learner could make nothing of the others."""
         with self.log.reading() as connection:
             there = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
         new = next(iter(candidates), None)
@@ -144,12 +144,10 @@ class Store(Generic[C]):
     def _file(self, candidates: Iterable[Candidate]) -> None:
         """Write arrays and gold, each under its id; in threads, since each file waits for the disk."""
         with ThreadPoolExecutor(WRITERS) as pool:
-            list(pool.map(self._file_one, candidates))
+            list(pool.map(self._file_one, candidates))  # waits, and raises what a thread raised
 
     def _file_one(self, candidate: Candidate) -> None:
-        if isinstance(candidate, Segment):
-            arrays = {"observations": candidate.observations, "actions": candidate.actions, "states": candidate.states}
-            write_arrays(self.folder / "blobs", candidate.id, {k: v for k, v in arrays.items() if v is not None})
+        write_candidate(candidate, self.folder / "blobs")
         if candidate.gold is not None:
             write_arrays(self.folder / "gold", candidate.id, {"gold": candidate.gold})
 
@@ -175,7 +173,7 @@ class Store(Generic[C]):
         """Queries with their judgements, in the order in which they were given, up to a sequence number."""
         answers = list(self._standing(JUDGEMENTS, upto))
         self._fetch({answer.query for answer in answers})
-        return [Judged(self.query(a.query), a) for a in answers if not isinstance(a, Skip)]
+        return [Judged(self.query(a.query), a) for a in answers if a.reason is None]
 
     def answers(self) -> list[Answer]:
         """Every answer that stands, skips included, in the order in which they were given."""
@@ -224,11 +222,8 @@ class Store(Generic[C]):
 
     def _bodies(self, ids: Sequence[str], kind: str) -> dict[str, Any]:
         """What was said of queries or candidates when they were asked."""
-        found: dict[str, Any] = {}
         with self.log.reading() as connection:
-            for some in chunks(ids, CHUNK):
-                chosen = sql.select(event.c.id, event.c.body).where(event.c.id.in_(some), event.c.kind == kind)
-                found |= {one.id: one.body for one in connection.execute(chosen)}
+            found = bodies(connection, ids)
         if missing := [id for id in ids if id not in found]:
             raise StoreError(f"the store in {self.folder} holds no {kind} {missing[0][:12]}")
         return found

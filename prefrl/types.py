@@ -1,4 +1,4 @@
-"""The vocabulary: what is judged, what is asked, what is answered. NumPy and the standard library only.
+"""The vocabulary: what can be judged and what is asked. NumPy and the standard library only.
 
 Shape letters, everywhere: T steps, O observation, A action, K candidates in a query, N candidates in a
 batch, M comparisons, E ensemble members, B sequences, L tokens, V vocabulary.
@@ -7,20 +7,42 @@ batch, M comparisons, E ensemble members, B sequences, L tokens, V vocabulary.
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from prefrl.numeric import check_weight, is_whole
-
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Integers: TypeAlias = npt.NDArray[np.integer[Any]]
+Bools: TypeAlias = npt.NDArray[np.bool_]
 Metrics: TypeAlias = dict[str, float]
 State: TypeAlias = dict[str, Any]
 """Nested dicts and lists of arrays, tensors, numbers, strings and None: what a checkpoint can hold."""
+LARGEST = 2**31 - 1
+"""The largest whole number in what comes from elsewhere: every database and every table holds it."""
+
+
+class Candidate(Protocol):
+    """One behaviour that can be judged. Each kind of them has a row in `prefrl.kinds`."""
+
+    @property
+    def id(self) -> str:
+        """sha256 of its content, the gold left out."""
+
+    @property
+    def context(self) -> str:
+        """Only candidates of one context may be compared."""
+
+    @property
+    def gold(self) -> Floats | None:
+        """(T,) the task's own values, one for each step, or (1,) for the whole. Hidden from all that learns."""
+
+
+C = TypeVar("C", bound=Candidate)
+C_contra = TypeVar("C_contra", bound=Candidate, contravariant=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +79,7 @@ class Segment:
     def id(self) -> str:
         """sha256 over names, dtypes, shapes and bytes (C order). The gold is not part of it."""
         arrays = {"observations": self.observations, "actions": self.actions, "states": self.states}
-        return _digest(f"{self.episode}/{self.start}", {k: v for k, v in arrays.items() if v is not None})
+        return digest(f"{self.episode}/{self.start}", {k: v for k, v in arrays.items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +104,7 @@ class Response:
     def id(self) -> str:
         """sha256 over prompt, text and tokens. The gold is not part of it."""
         tokens = {"prompt_tokens": np.array(self.prompt_tokens, np.int64), "tokens": np.array(self.tokens, np.int64)}
-        return _digest(f"{self.prompt}\0{self.text}", tokens)
-
-
-Candidate: TypeAlias = Segment | Response
-C = TypeVar("C", Segment, Response)
-C_contra = TypeVar("C_contra", Segment, Response, contravariant=True)
+        return digest(f"{self.prompt}\0{self.text}", tokens)
 
 
 def gold_score(candidate: Candidate) -> float:
@@ -120,131 +137,6 @@ class Query(Generic[C]):
     def id(self) -> str:
         """sha256 over the candidates' ids."""
         return hashlib.sha256("".join(c.id for c in self.candidates).encode()).hexdigest()
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Two candidates judged."""
-
-    query: str
-    preference: float
-    """In [0, 1]: the probability that the first candidate is better; 0.5 is a tie, a strength lies between."""
-    labeler: str = ""
-    shown: tuple[int, ...] = ()
-    """The order in which the candidates were shown; the preference itself is in the query's own order."""
-    weight: float = 1.0
-    """How much the judgement counts in a fit."""
-
-    def __post_init__(self) -> None:
-        check_weight(self.weight)
-        if not 0.0 <= self.preference <= 1.0:
-            raise ValueError(f"a preference must lie in [0, 1], got {self.preference}")
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """K candidates judged."""
-
-    query: str
-    ranks: tuple[int, ...]
-    """A rank for each candidate, in the query's own order; 0 is best, equal ranks are ties."""
-    labeler: str = ""
-    shown: tuple[int, ...] = ()
-    weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_weight(self.weight)
-        if len(self.ranks) < 2 or not all(is_whole(rank) for rank in self.ranks):
-            raise ValueError(f"a ranking needs a whole rank >= 0 for each of at least 2 candidates, got {self.ranks}")
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The best of K candidates; nothing is said of the others."""
-
-    query: str
-    best: int
-    """Which candidate, counted from 0 in the query's own order."""
-    labeler: str = ""
-    shown: tuple[int, ...] = ()
-    weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_weight(self.weight)
-        if not is_whole(self.best):
-            raise ValueError(f"the best candidate is counted from 0, got {self.best}")
-
-
-@dataclass(frozen=True)
-class Rating:
-    """Each candidate on a scale of its own right, such as one to five stars."""
-
-    query: str
-    levels: tuple[int, ...]
-    """A level for each candidate, in the query's own order; 0 is worst, `scale` - 1 is best."""
-    scale: int
-    """How many levels there are."""
-    labeler: str = ""
-    shown: tuple[int, ...] = ()
-    weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_weight(self.weight)
-        right = all(is_whole(level) and level < self.scale for level in self.levels)
-        if not (is_whole(self.scale) and self.scale >= 2 and self.levels and right):
-            raise ValueError(
-                f"a rating needs whole levels from 0 to scale - 1, got {self.levels} on a scale of {self.scale}"
-            )
-
-
-def person(labeler: str) -> str:
-    """Who gave a judgement: NAME, also of NAME#2, which is their second answer to a question in one file."""
-    name, mark, number = labeler.rpartition("#")
-    return name if name and mark and number.isdigit() else labeler
-
-
-@dataclass(frozen=True)
-class Skip:
-    """No judgement. A skip may be asked again of someone else; incomparable says that there is no answer."""
-
-    query: str
-    reason: Literal["skip", "incomparable"] = "skip"
-    labeler: str = ""
-    shown: tuple[int, ...] = ()
-
-
-Judgement: TypeAlias = Comparison | Ranking | Choice | Rating
-Answer: TypeAlias = Judgement | Skip
-
-
-@dataclass(frozen=True)
-class Judged(Generic[C]):
-    """A query with one judgement on it. Raises `ValueError` where the two do not fit."""
-
-    query: Query[C]
-    judgement: Judgement
-
-    def __post_init__(self) -> None:
-        if self.judgement.query != self.query.id:
-            raise ValueError(f"query {self.query.id[:12]} got a judgement of query {self.judgement.query[:12]}")
-        check_fits(self.judgement, len(self.query.candidates))
-
-
-def check_fits(answer: Answer, size: int) -> None:
-    """Raise `ValueError` where an answer does not fit a query of `size` candidates."""
-    match answer:
-        case Comparison():
-            fits = size == 2
-        case Ranking(ranks=ranks):
-            fits = size == len(ranks)
-        case Choice(best=best):
-            fits = size >= 2 and best < size
-        case Rating(levels=levels):
-            fits = size == len(levels)
-        case Skip():
-            fits = True
-    if not fits:
-        raise ValueError(f"query {answer.query[:12]} has {size} candidates; got {answer}")
 
 
 class Steps(NamedTuple):
@@ -291,9 +183,15 @@ class Round(Generic[C]):
     """What did not go as asked, for people."""
 
 
-def _digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
-    digest = hashlib.sha256(header.encode("utf-8", "surrogatepass"))
+def is_whole(value: Any, most: float = math.inf) -> bool:
+    """Whether a value is a whole number from 0 on, true and false not among them."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) <= most
+
+
+def digest(header: str, arrays: dict[str, npt.NDArray[Any]]) -> str:
+    """The id of a candidate, from its text and its named arrays: sha256 over names, dtypes, shapes and bytes."""
+    found = hashlib.sha256(header.encode("utf-8", "surrogatepass"))
     for name, array in arrays.items():
-        digest.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+        found.update(f"\0{name}:{array.dtype.str}:{array.shape}:".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()

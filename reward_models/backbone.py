@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from jinja2 import TemplateError
 from torch import Tensor
-from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
+from transformers import AutoModel, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.models.auto.modeling_auto import MODEL_FOR_MASKED_LM_MAPPING_NAMES
-from transformers.utils.logging import (
-    disable_progress_bar,
-    enable_progress_bar,
-    get_verbosity,
-    is_progress_bar_enabled,
-    set_verbosity,
-    set_verbosity_error,
-)
 
 from prefrl.components import ConfigError
-from prefrl.label.transcripts import prompt_messages, response_messages
+from prefrl.exchange.transcripts import prompt_messages, response_messages
+from prefrl.policies.pretrained import first_line, load_tokenizer, load_weights
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
+from prefrl.seeding import to_numpy
 from prefrl.types import Response
 
 Train = Literal["full", "lora", "head"]
@@ -78,28 +71,32 @@ class Backbone:
         """(N, L) right-padded rows with their lengths (N,) -> (N, d) what the heads see."""
         if self.model.config.model_type in MODELS:
             return final_states(self.model, pack(tokens, lengths))
+        # Rows of like length share a pass, and are put back in their order by the inverse permutation.
         order = lengths.argsort()
         parts = [self._padded_states(tokens[part], lengths[part]) for part in torch.split(order, BUCKET)]
         return torch.cat(parts)[order.argsort()]
 
     def _padded_states(self, tokens: Tensor, lengths: Tensor) -> Tensor:
-        tokens = tokens[:, : int(lengths.max())]
-        mask = torch.arange(tokens.shape[1]) < lengths[:, None]
+        tokens = tokens[:, : int(lengths.max())]  # a part needs no more columns than its longest row
+        mask = torch.arange(tokens.shape[1], device=tokens.device) < lengths[:, None]
         found = self.model(input_ids=tokens, attention_mask=mask.long())
+        # Of a classifier whose last layer is the identity, the logits (n, d) are what that layer was given.
         hidden: Tensor = found.logits if self.pool == "own" else found.last_hidden_state
         if self.pool == "own":
             return hidden
         if self.pool == "mean":
-            return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]
-        return hidden[torch.arange(len(tokens)), lengths - 1 if self.pool == "last" else 0]
+            return (hidden * mask[:, :, None]).sum(1) / lengths[:, None]  # (n, L, d) -> (n, d), padding left out
+        # By length, not by looking for padding: where padding is the end token, a search finds the wrong place.
+        return hidden[torch.arange(len(tokens), device=tokens.device), lengths - 1 if self.pool == "last" else 0]
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
         ended = not response.tokens or response.tokens[-1] == self.policy_end
-        if self.chat:
+        if self.chat:  # first of all: a template reads the text, whatever was sampled
             return in_turns(self.tokenizer, response, ended)
         sampled = self.policy_end is None
         prompt = list((sampled and response.prompt_tokens) or self.tokenizer.encode(response.prompt))
+        # As sampled: text that is encoded anew can merge across the border, and its tokens are then others.
         if sampled and response.tokens:
             return [*prompt, *response.tokens]
         end = end_token(self.tokenizer)
@@ -148,7 +145,9 @@ def of_policy(task: TextTask, chat: bool) -> Backbone:
 
 def of_folder(name: str, task: TextTask, download: bool, pool: Literal["first", "mean"], chat: bool) -> Backbone:
     """A model of transformers by folder or name. Raises `ConfigError` where it cannot be used."""
-    return _ready(load_weights(AutoModel, name, download), load_tokenizer(name, download), task, pool, chat)
+    return _ready(
+        load_weights(AutoModel, name, download, "reward.download"), load_tokenizer(name, download), task, pool, chat
+    )
 
 
 def of_classifier(model: Any, head: str, tokenizer: PreTrainedTokenizerBase, task: TextTask, chat: bool) -> Backbone:
@@ -170,10 +169,13 @@ def _ready(model: Any, tokenizer: PreTrainedTokenizerBase, task: TextTask, pool:
     if chat and tokenizer.chat_template is None:
         raise ConfigError("reward.chat_template is true, but the reward's tokenizer has no chat template")
     if model.config.model_type in MODELS:
+        # Only what was tested against padded rows is packed; other architectures may mix tokens in other ways.
         use_packed_attention(model)
+    # Two tokenizers with one vocabulary read the same ids, so what was sampled need not be encoded again.
     same = tokenizer is task.tokenizer or tokenizer.get_vocab() == task.tokenizer.get_vocab()
     policy_end = None if same and not chat else end_token(task.tokenizer)
     pool = pool if is_encoder(model) else "last"
+    # Evaluation mode for good: dropout would give one response a different score in each pass.
     return Backbone(model.eval(), tokenizer, policy_end, int(model.config.hidden_size), pool, chat=chat)
 
 
@@ -182,39 +184,6 @@ def _after_padding(model: PreTrainedModel) -> list[int]:
     tables = [m for n, m in model.named_modules() if n.endswith("position_embeddings")]
     starts = [(m, m.padding_idx) for m in tables if isinstance(m, torch.nn.Embedding)]
     return [m.num_embeddings - start - 1 for m, start in starts if start is not None]
-
-
-def load_weights(auto: Any, name: str, download: bool) -> PreTrainedModel:
-    """Float32, from safetensors alone and without anybody's code. Raises `ConfigError` where weights are missing."""
-    where = {"local_files_only": not download, "trust_remote_code": False}
-    try:
-        with quiet():
-            model, info = auto.from_pretrained(
-                name, dtype=torch.float32, use_safetensors=True, output_loading_info=True, **where
-            )
-    except (OSError, ValueError) as error:
-        hint = first_line(error) if download else "only local files are looked at unless reward.download is true"
-        raise ConfigError(f"no model in safetensors could be read from {name!r}: {hint}") from error
-    headless = auto is AutoModel  # then nothing reads a pooler
-    if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
-        raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
-    found: PreTrainedModel = model
-    return found
-
-
-def load_tokenizer(name: str, download: bool) -> PreTrainedTokenizerBase:
-    try:
-        found: PreTrainedTokenizerBase = AutoTokenizer.from_pretrained(
-            name, local_files_only=not download, trust_remote_code=False
-        )
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"no tokenizer could be read from {name!r}: {first_line(error)}") from error
-    return found
-
-
-def first_line(error: Exception) -> str:
-    """What went wrong; the advice that libraries add is for others."""
-    return str(error).strip().partition("\n")[0]
 
 
 def trainable(backbone: Backbone, train: Train) -> dict[str, torch.nn.Parameter]:
@@ -229,19 +198,6 @@ def digest(named: Mapping[str, Tensor]) -> str:
     found = hashlib.sha256()
     for name, value in named.items():
         found.update(name.encode())
-        found.update(value.detach().contiguous().view(torch.uint8).numpy().tobytes())
+        # As bytes, since NumPy has no bfloat16.
+        found.update(to_numpy(value.detach().contiguous().view(torch.uint8)).tobytes())
     return found.hexdigest()
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep transformers from drawing bars, and from reporting on the head that is left out."""
-    shown, verbosity = is_progress_bar_enabled(), get_verbosity()
-    disable_progress_bar()  # type: ignore[no-untyped-call]
-    set_verbosity_error()  # type: ignore[no-untyped-call]
-    try:
-        yield
-    finally:
-        set_verbosity(verbosity)
-        if shown:
-            enable_progress_bar()  # type: ignore[no-untyped-call]

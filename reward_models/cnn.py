@@ -14,12 +14,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from prefrl.components import ConfigError, Settings
-from prefrl.protocols import ControlTask, Task
+from prefrl.protocols import ControlTask, Task, control
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
-from prefrl.reward_models.network import CACHED, uniform
-from prefrl.reward_models.steps import StepReward, control, each_input
-from prefrl.seeding import draw_seed
+from prefrl.reward_models.steps import CACHED, StepReward, each_input, uniform
+from prefrl.seeding import generator
 
 
 class CNNSettings(Settings):
@@ -43,9 +42,9 @@ class CNNSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         _check(self.image, found)
-        network = CNN(self, found.action_size, torch.Generator().manual_seed(draw_seed(rng)))
+        network = CNN(self, found.action_size, generator(rng))
         return StepReward(network, found, self.gain, self.combine, self.measure)
 
     def measure(self, steps: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,10 +52,10 @@ class CNNSettings(Settings):
         pixels = math.prod(self.image)
         action_mean, action_std = each_input(steps[:, pixels:])
         if self.brightest is not None:
-            mean, std = torch.tensor(0.0), torch.tensor(self.brightest)
+            mean, std = steps.new_tensor(0.0), steps.new_tensor(self.brightest)
         else:
             std, mean = torch.std_mean(steps[:, :pixels], correction=0)
-        std = std if std > 1e-6 else torch.tensor(1.0)
+        std = std if std > 1e-6 else steps.new_tensor(1.0)  # pictures of one colour
         return torch.cat([mean.expand(pixels), action_mean]), torch.cat([std.expand(pixels), action_std])
 
 
@@ -65,15 +64,15 @@ class CNN:
 
     memory, first = 1, None
 
-    def __init__(self, settings: CNNSettings, actions: int, generator: torch.Generator) -> None:
+    def __init__(self, settings: CNNSettings, actions: int, order: torch.Generator) -> None:
         self.members, self.most, self._image = settings.members, CACHED // settings.members, settings.image
         height, width, channels = settings.image
         pairs = list(pairwise((channels, *settings.channels)))
-        self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, generator) for i, o in pairs]
-        self._biases = [uniform((self.members * o,), 9 * i, generator) for i, o in pairs]
+        self._filters = [uniform((self.members * o, i, 3, 3), 9 * i, order) for i, o in pairs]
+        self._biases = [uniform((self.members * o,), 9 * i, order) for i, o in pairs]
         halved = (-(-size // 2 ** len(pairs)) for size in (height, width))
         found = math.prod(halved) * settings.channels[-1]
-        self._head = MLP(self.members, (found + actions, *settings.hidden, 1), "relu", generator)
+        self._head = MLP(self.members, (found + actions, *settings.hidden, 1), "relu", order)
 
     def named(self) -> Mapping[str, Tensor]:
         filters = {f"filter_{i}": w for i, w in enumerate(self._filters)}
@@ -83,11 +82,12 @@ class CNN:
         pixels = math.prod(self._image)
         steps = inputs.view(-1, *inputs.shape[-3:]).flatten(1, 2)  # (1, S, I), or (E, S, I) of each member's own
         pictures = steps[:, :, :pixels].reshape(*steps.shape[:2], *self._image)
+        # (1 or E, S, height, width, C) -> (S, C or E C, height, width), as convolutions have it.
         x = pictures.permute(1, 0, 4, 2, 3).flatten(1, 2)
         for i, (weight, bias) in enumerate(zip(self._filters, self._biases, strict=True)):
             # Where all see one picture, the first layer is one convolution with the filters of all.
             x = torch.relu_(conv2d(x, weight, bias, stride=2, padding=1, groups=self.members if i else len(steps)))
-        seen = x.reshape(len(x), self.members, -1).transpose(0, 1)
+        seen = x.reshape(len(x), self.members, -1).transpose(0, 1)  # (S, E filters, h, w) -> (E, S, filters h w)
         both = torch.cat([seen, steps[:, :, pixels:].expand(self.members, -1, -1)], 2)
         return self._head.of_steps(both).view(self.members, *inputs.shape[-3:-1])
 

@@ -30,6 +30,7 @@ def combine(values: Floats, settings: Ensemble, fits: int) -> Floats:
     count steps of the policy; here it is the fits that make the reward surer). One member has no spread.
     """
     found: Floats = values.min(0) if settings.by == "worst" else values.mean(0)
+    # max: before the first fit the bonus is as large as after it, and no larger.
     beta = settings.optimism * (1 - settings.optimism_decay) ** max(fits - 1, 0)
     spread = beta - (settings.caution if settings.by == "lower" else 0.0)
     return found + spread * values.std(0) if spread else found

@@ -1,60 +1,53 @@
-"""Reward models as others keep them: sequence classifiers of transformers, and the files of RewardBench."""
+"""Reward models as others keep them: sequence classifiers of transformers."""
 
 from __future__ import annotations
 
 import copy
-import json
-import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 from transformers import AutoModelForSequenceClassification, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
-from prefrl.files import whole_folder, write_file
+from prefrl.policies.pretrained import load_tokenizer, load_weights, quiet
 from prefrl.protocols import TextTask
 from prefrl.reward_models.backbone import (
     Backbone,
     end_token,
     is_encoder,
-    load_tokenizer,
-    load_weights,
     of_classifier,
-    quiet,
 )
 from prefrl.reward_models.packing import ATTENTION
-from prefrl.reward_models.text import TransformerReward, TransformerSettings
+from prefrl.storage.files import whole_folder
 
 PAD = "<|pad|>"
 """Added to a tokenizer whose padding could be taken for the end of a response."""
 
 
 def load_classifier(
-    name: str, task: TextTask, settings: TransformerSettings, rng: np.random.Generator
-) -> TransformerReward:
-    """A reward model of one member from an `AutoModelForSequenceClassification` checkpoint: its scores are its logits.
+    name: str, task: TextTask, download: bool, chat_template: bool | None
+) -> tuple[Backbone, torch.nn.Linear]:
+    """The backbone and the head (1, d) of an `AutoModelForSequenceClassification` checkpoint; its logits are the score.
 
-    Raises `ConfigError` unless it has one label, and is a causal model with one linear head on the last token or an
-    encoder that ends in one linear layer, whatever it has before that.
+    `chat_template`: whether it reads by one; None where its tokenizer decides. Raises `ConfigError` unless it has one
+    label, and is a causal model with one linear head on the last token or an encoder that ends in one linear layer,
+    whatever it has before that.
     """
-    model: Any = load_weights(AutoModelForSequenceClassification, name, settings.download)
+    model: Any = load_weights(AutoModelForSequenceClassification, name, download, "reward.download")
     if model.config.num_labels != 1:
         raise ConfigError(f"{name} tells {model.config.num_labels} labels apart; a reward model has num_labels=1")
-    path, tokenizer = _last_layer(model, name), load_tokenizer(name, settings.download)
+    path, tokenizer = _last_layer(model, name), load_tokenizer(name, download)
+    # Before the last layer is taken off below, which would change what the model itself says.
     head, alone = model.get_submodule(path), _logit(model) if is_encoder(model) else None
-    chat = tokenizer.chat_template is not None if settings.chat_template is None else settings.chat_template
+    chat = tokenizer.chat_template is not None if chat_template is None else chat_template
     backbone = of_classifier(model, path, tokenizer, task, chat)
     if alone is not None and not torch.allclose(_padded_logit(backbone, head), alone, rtol=1e-4, atol=1e-5):
         raise ConfigError(
             f"{name}: the score of a {type(model).__name__} hangs on padding, or is not what its last linear layer "
             f"`{path}` says; use it as a backbone"
         )
-    reward = TransformerReward(settings, backbone, rng)
-    reward.start_from(head)
-    return reward
+    return backbone, head
 
 
 def _last_layer(model: Any, name: str) -> str:
@@ -88,19 +81,19 @@ def _padded_logit(backbone: Backbone, head: torch.nn.Module) -> torch.Tensor:
     return found[:1]
 
 
-def save_classifier(reward: TransformerReward, folder: Path) -> float:
+def save_classifier(backbone: Backbone, weight: torch.Tensor, constant: float, folder: Path) -> float:
     """Write a reward model as an `AutoModelForSequenceClassification` checkpoint with its tokenizer.
 
-    Its logit is the mean of the members after shift and scale, less a constant where such heads have no bias, as those
-    of causal models; the constant is returned. Adapters are merged. A chat template is written only if the model reads
-    by it. Raises ValueError for an encoder that did not come from a checkpoint.
+    Its logit is the head's, `features @ weight` (d,) plus a constant, less that constant where such heads have no bias,
+    as those of causal models; what is missing is returned. Adapters are merged. A chat template is written only if the
+    model reads by it. Raises ValueError for an encoder that did not come from a checkpoint.
     """
-    backbone, (weight, constant) = reward.backbone, reward.mean_head()
     if backbone.pool not in ("last", "own"):
         raise ValueError(
             f"a {backbone.model.config.model_type} is an encoder, whose classifiers have deeper heads than ours: only "
             "causal models, and encoders that came from a reward.checkpoint, are exported"
         )
+    # A copy: the tokenizer that the fitted model reads with must not get a padding token, or lose its template.
     tokenizer, model = copy.deepcopy(backbone.tokenizer), _without_adapters(backbone.model)
     if not backbone.chat:
         tokenizer.chat_template = None
@@ -129,7 +122,7 @@ def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedMo
     config.num_labels = 1
     if config._attn_implementation == ATTENTION:
         config._attn_implementation = None  # whatever the architecture has by default
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]):  # its random head is overwritten, and must not move the global generator
         model: Any = AutoModelForSequenceClassification.from_config(config)  # type: ignore[no-untyped-call]
     model.base_model.load_state_dict(backbone.state_dict())
     model.score.weight.data.copy_(weight[None])
@@ -140,6 +133,7 @@ def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedMo
 def _closed(model: PreTrainedModel, path: str, weight: torch.Tensor, bias: float) -> PreTrainedModel:
     """A copy of an encoder's classifier with a last layer again: (d,) and a number."""
     found = copy.deepcopy(model)
+    # Draws no random numbers for what is overwritten at once.
     head = torch.nn.utils.skip_init(torch.nn.Linear, len(weight), 1)  # type: ignore[no-untyped-call]
     head.weight.data.copy_(weight[None])
     head.bias.data.fill_(bias)
@@ -151,47 +145,6 @@ def _give_padding(model: Any, tokenizer: PreTrainedTokenizerBase) -> None:
     """Of its own where it is missing or is the end: causal classifiers look for the last token that is no padding."""
     if tokenizer.pad_token_id is None or tokenizer.pad_token_id == end_token(tokenizer):
         tokenizer.add_special_tokens({"pad_token": PAD})
-        if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:
+        if len(tokenizer) > model.get_input_embeddings().weight.shape[0]:  # some models have rows to spare
             model.resize_token_embeddings(len(tokenizer), mean_resizing=False)
     model.config.pad_token_id = tokenizer.pad_token_id
-
-
-class ScoredPair(NamedTuple):
-    """One row of a benchmark: two texts, the better one first, and what a reward model says of them."""
-
-    id: int
-    subset: str
-    text_chosen: str
-    text_rejected: str
-    score_chosen: float
-    score_rejected: float
-
-
-def write_rewardbench(folder: Path, model: str, rows: Sequence[ScoredPair], chat: bool = False) -> dict[str, float]:
-    """Write scores as RewardBench (Lambert et al. 2024) keeps its results; returns each subset's accuracy.
-
-    `eval-set-scores/MODEL.json` has a list for each column, `eval-set/MODEL.json` the accuracies; a tie is an error.
-    `chat`: the texts were scored in the chat template of the model's tokenizer.
-    Raises ValueError for a score that is not finite, and where there are no rows.
-    """
-    path = f"{model}.json"
-    if not rows or not model or ".." in Path(path).parts or Path(path).is_absolute():
-        raise ValueError(f"expected a model's name and at least one row, got {model!r} and {len(rows)} rows")
-    if bad := [r.id for r in rows if not (math.isfinite(r.score_chosen) and math.isfinite(r.score_rejected))]:
-        raise ValueError(f"RewardBench row {bad[0]}: expected finite scores, got NaN or infinity")
-    about = {"model": model, "model_type": "Seq. Classifier", "chat_template": "tokenizer" if chat else "none"}
-    right = [int(r.score_chosen > r.score_rejected) for r in rows]
-    subsets = sorted({r.subset for r in rows})
-    accuracy = {s: float(np.mean([c for r, c in zip(rows, right, strict=True) if r.subset == s])) for s in subsets}
-    _write_json(folder / "eval-set-scores" / path, about | _columns(rows) | {"results": right})
-    _write_json(folder / "eval-set" / path, about | accuracy)
-    return accuracy
-
-
-def _columns(rows: Sequence[ScoredPair]) -> dict[str, list[Any]]:
-    names = ("id", "subset", "text_chosen", "text_rejected", "scores_chosen", "scores_rejected")
-    return {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_file(path, json.dumps(content, indent=4, sort_keys=True).encode())

@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from prefrl.components import ConfigError, Settings, feature_functions, suggest
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED, Describe, input_width
-from prefrl.reward_models.steps import StepReward, control
+from prefrl.reward_models.steps import CACHED, Describe, StepReward, input_width
+from prefrl.seeding import to_numpy
 from prefrl.types import Floats
 
 STEPS = 200
@@ -42,7 +42,7 @@ class LinearSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
-        found, describe = control(task, self.kind), self._hand_made()
+        found, describe = control(task, f"reward kind {self.kind!r} scores control segments"), self._hand_made()
         network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 
@@ -74,6 +74,7 @@ class Linear:
         self._quadratic = settings.features == "quadratic"
         size = inputs + (inputs * (inputs + 1) // 2 if self._quadratic else 0)
         half = rng.standard_normal((settings.members // 2, size))
+        # In pairs around the mode, so that the members' mean is the mode itself and not a draw.
         draws = np.concatenate([half, -half, np.zeros((settings.members % 2, size))])
         self._draws = torch.from_numpy(draws)
         self._weight = (self._draws * settings.prior_std).float()[:, :, None]
@@ -87,22 +88,26 @@ class Linear:
         return None if self._quadratic else (self._weight, self._bias)
 
     def outputs(self, inputs: Tensor) -> Tensor:
-        x = self.features(inputs).flatten(-3, -2).expand(self.members, -1, -1)
+        x = self.features(inputs).flatten(-3, -2).expand(self.members, -1, -1)  # (E, B T, d)
         return torch.baddbmm(self._bias, x, self._weight).view(self.members, *inputs.shape[-3:-1])
 
     def features(self, inputs: Tensor) -> Tensor:
         """(..., I) -> (..., d)."""
         if not self._quadratic:
             return inputs
-        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1])
+        # each product once, squares among them
+        i, j = torch.triu_indices(inputs.shape[-1], inputs.shape[-1], device=inputs.device)
         return torch.cat([inputs, inputs[..., i] * inputs[..., j] - (i == j).float()], -1)
 
     def solve(self, inputs: Tensor, counts: Tensor, loss: Loss) -> None:
         """Find the posterior. Raises ValueError for a candidate that is not finite, and where no maximum is found."""
+        # (N, d), candidate by candidate: the features of all steps at once would be T times as large. In float64, since
+        # the Hessian is factorised.
         design = torch.stack([count @ self.features(x) for x, count in zip(inputs, counts, strict=True)]).double()
         if not design.isfinite().all():
             at = int((~design.isfinite()).any(1).nonzero()[0])
             raise ValueError(f"candidate {at} of the fit has features that are not finite: look for NaN or inf in it")
+        # The loss takes E rows of scores; all are the same here, and their mean is one member's.
         w, hessian = maximum(design, lambda scores: loss(scores.expand(self.members, -1)).mean(), self._prior_std)
         # H = L L' gives H^-1 = L^-T L^-1, so that L^-T z has this covariance.
         spread = torch.linalg.solve_triangular(torch.linalg.cholesky(hessian).T, self._draws.T, upper=True).T
@@ -121,16 +126,16 @@ def maximum(design: Tensor, loss: Loss, prior_std: float) -> tuple[Tensor, Tenso
         return loss(design @ w) + 0.5 * (w / prior_std).square().sum()
 
     def value_and_gradient(at: Floats) -> tuple[float, Floats]:
-        w = torch.tensor(at, requires_grad=True)
+        w = torch.tensor(at, device=design.device, requires_grad=True)
         with torch.enable_grad():
             value = objective(w)
             (gradient,) = torch.autograd.grad(value, w)
-        return float(value), gradient.numpy()
+        return float(value), to_numpy(gradient)
 
     def hessian(at: Floats) -> Floats:
         with torch.enable_grad():
-            found: Tensor = torch.autograd.functional.hessian(objective, torch.tensor(at))  # type: ignore[no-untyped-call]
-        return found.numpy()
+            found: Tensor = torch.autograd.functional.hessian(objective, torch.tensor(at, device=design.device))  # type: ignore[no-untyped-call]
+        return to_numpy(found)
 
     options: Any = {"gtol": 1e-6, "maxiter": STEPS}
     start = np.zeros(design.shape[1])
@@ -142,4 +147,5 @@ def maximum(design: Tensor, loss: Loss, prior_std: float) -> tuple[Tensor, Tenso
             f"the linear reward's most probable weights were not found in {STEPS} Newton steps ({found.message}); "
             "make reward.prior_std smaller"
         )
-    return torch.tensor(found.x), torch.tensor(found.hess)
+    w, curvature = (torch.tensor(x, device=design.device) for x in (found.x, found.hess))
+    return w, curvature

@@ -21,7 +21,9 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
     `targets`: "all-linear", or "default" for those that peft takes for this architecture.
     """
     chosen = "all-linear" if targets == "all-linear" else None
+    # No dropout: the scores of one response must not differ between passes.
     config = LoraConfig(r=rank, lora_alpha=2 * rank, lora_dropout=0.0, target_modules=chosen)
+    # peft draws from torch's global generator.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(draw_seed(rng))
         try:
@@ -34,7 +36,7 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
 
 def merged(model: PreTrainedModel) -> PreTrainedModel:
     """A copy with its adapters, if it has any, added to its own matrices."""
-    found = copy.deepcopy(model)
+    found = copy.deepcopy(model)  # the original goes on being fitted, with its adapters apart
     for name, module in list(found.named_modules()):
         if isinstance(module, BaseTunerLayer):
             layer: Any = module

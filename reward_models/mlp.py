@@ -12,12 +12,11 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.components import Settings
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import uniform
 from prefrl.reward_models.perceptron import Activation, perceptrons
-from prefrl.reward_models.steps import StepReward, control
-from prefrl.seeding import draw_seed
+from prefrl.reward_models.steps import StepReward, uniform
+from prefrl.seeding import generator
 
 
 class MLPSettings(Settings):
@@ -36,10 +35,9 @@ class MLPSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         sizes = (found.observation_size + found.action_size, *self.hidden, 1)
-        return StepReward(MLP(self.members, sizes, self.activation, generator), found, self.gain, self.combine)
+        return StepReward(MLP(self.members, sizes, self.activation, generator(rng)), found, self.gain, self.combine)
 
 
 class MLP:
@@ -47,13 +45,11 @@ class MLP:
 
     memory, most = 1, 1_000_000  # it divides them itself, by its widths
 
-    def __init__(
-        self, members: int, sizes: tuple[int, ...], activation: Activation, generator: torch.Generator
-    ) -> None:
+    def __init__(self, members: int, sizes: tuple[int, ...], activation: Activation, order: torch.Generator) -> None:
         pairs = list(pairwise(sizes))
         self.members, self._activation = members, activation
-        self.weights = [uniform((members, i, o), i, generator) for i, o in pairs]
-        self.biases = [uniform((members, 1, o), i, generator) for i, o in pairs]
+        self.weights = [uniform((members, i, o), i, order) for i, o in pairs]
+        self.biases = [uniform((members, 1, o), i, order) for i, o in pairs]
 
     def named(self) -> Mapping[str, Tensor]:
         weights = {f"weight_{i}": w for i, w in enumerate(self.weights)}

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import embedding, scaled_dot_product_attention
 from transformers import AttentionInterface, PreTrainedModel
 
+from prefrl.seeding import to_numpy
 from prefrl.types import Integers
 
 ATTENTION = "prefrl_packed"
@@ -40,28 +41,31 @@ class Packed:
     @property
     def ends(self) -> Tensor:
         """(N,) int64: which of the P is each row's last token."""
-        return self.rows[torch.arange(len(self.rows)), self.lengths - 1]
+        return self.rows[torch.arange(len(self.rows), device=self.rows.device), self.lengths - 1]
 
 
 def pack(tokens: Tensor, lengths: Tensor) -> Packed:
     """Rows (N, L) with their lengths (N,), right-padded with anything."""
-    counts, width = lengths.numpy(), int(lengths.max())
+    counts, width = to_numpy(lengths), int(lengths.max())
     real = np.arange(width) < counts[:, None]
-    values = np.where(real, tokens.numpy()[:, :width], -1)  # no token, so that what pads is like nothing real
-    order = np.lexsort(values.T[::-1])
+    values = np.where(real, to_numpy(tokens)[:, :width], -1)  # no token, so that what pads is like nothing real
+    order = np.lexsort(values.T[::-1])  # lexsort's last key counts most, so the first token must come last
     source = np.empty_like(values)
+    # (N, L): of the rows that begin alike up to a place, the one that is computed for all of them.
     source[order] = order[_first_alike(values[order])]
     fresh = real & (source == np.arange(len(values))[:, None])
-    numbers = np.cumsum(fresh).reshape(fresh.shape) - 1
+    numbers = np.cumsum(fresh).reshape(fresh.shape) - 1  # (N, L): what a fresh place is counted as among the P
     rows = np.where(real, np.take_along_axis(numbers, source, 0), 0)
     origin = np.flatnonzero(fresh)
-    return Packed(*map(torch.from_numpy, (values[fresh], origin % width, rows, origin, counts)))
+    arrays = (values[fresh], origin % width, rows, origin, counts)
+    return Packed(*(torch.from_numpy(x).to(tokens.device) for x in arrays))
 
 
 def _first_alike(values: Integers) -> Integers:
     """(N, L) sorted rows -> (N, L): the first row of those that have the same tokens up to each place."""
-    alike = np.logical_and.accumulate(values[1:] == values[:-1], 1)
+    alike = np.logical_and.accumulate(values[1:] == values[:-1], 1)  # like the row before, up to each place
     starts = np.where(alike, 0, np.arange(1, len(values))[:, None])
+    # Sorted rows that begin alike are neighbours, so the newest start above is that of the group.
     return np.maximum.accumulate(np.concatenate([np.zeros_like(values[:1]), starts]), 0)
 
 
@@ -99,9 +103,10 @@ def attend_packed(
     with torch.autocast(query.device.type, enabled=False):
         q, k, v = (_spread(x[0].transpose(0, 1), packed.rows) for x in (query, key, value))
         grouped = q.shape[1] != k.shape[1]
+        # Padding is on the right, where causal attention never looks from a real token.
         found = scaled_dot_product_attention(q, k, v, is_causal=True, scale=scaling, enable_gqa=grouped)
-        flat = found.transpose(1, 2).flatten(0, 1)
-        picked = embedding(packed.origin, flat.flatten(1))
+        flat = found.transpose(1, 2).flatten(0, 1)  # (N, heads, L, D) -> (N L, heads, D)
+        picked = embedding(packed.origin, flat.flatten(1))  # (P, heads D): each beginning from one of its places
     return picked.view(1, -1, *flat.shape[1:]).to(value.dtype), None
 
 
@@ -127,6 +132,7 @@ def _last_layer(layer: Any, x: Tensor, turns: tuple[Tensor, Tensor], packed: Pac
     k, v = (project(normed).view(len(x), -1, attention.head_dim) for project in (attention.k_proj, attention.v_proj))
     q = attention.q_proj(normed[ends]).view(len(ends), -1, attention.head_dim)
     cos, sin = (turn[:, None] for turn in turns)
+    # Only the last tokens ask, but every token of their rows answers.
     found = _attend_from_ends(_turn(q, cos[ends], sin[ends]), _turn(k, cos, sin), v, packed, attention.scaling)
     x = x[ends] + attention.o_proj(found.to(v.dtype))
     added: Tensor = layer.mlp(layer.post_attention_layernorm(x))
@@ -135,7 +141,8 @@ def _last_layer(layer: Any, x: Tensor, turns: tuple[Tensor, Tensor], packed: Pac
 
 def _attend_from_ends(q: Tensor, k: Tensor, v: Tensor, packed: Packed, scaling: float) -> Tensor:
     """One query (heads, D) a row: (N, heads, D), (P, groups, D), (P, groups, D) -> (N, heads x D)."""
-    real = torch.arange(packed.rows.shape[1]) < packed.lengths[:, None]
+    # No causal mask here, since the last token sees its whole row: padding is masked instead.
+    real = torch.arange(packed.rows.shape[1], device=packed.rows.device) < packed.lengths[:, None]
     with torch.autocast(q.device.type, enabled=False):
         keys, values, grouped = _spread(k, packed.rows), _spread(v, packed.rows), q.shape[1] != k.shape[1]
         found = scaled_dot_product_attention(

@@ -56,6 +56,7 @@ def perceptrons(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], 
     if torch.is_grad_enabled():
         found: Tensor = _Perceptrons.apply(x, activation, *weights, *biases)  # type: ignore[no-untyped-call]
         return found
+    # Without a gradient nothing is kept, and each piece's memory is free again at once.
     return _all(x, weights, biases, _FUNCTIONS[activation], None)
 
 
@@ -73,6 +74,7 @@ class _Perceptrons(torch.autograd.Function):
         (gradient,), weights = gradients, ctx.saved_tensors
         of_weights = [torch.zeros_like(w) for w in weights]
         of_biases = [w.new_zeros(len(w), 1, w.shape[2]) for w in weights]
+        # Zeros, since members that share the steps add up in it.
         of_x = gradient.new_zeros(ctx.shape) if ctx.needs_input_grad[0] else None
         for piece in ctx.pieces:
             of_input = None if of_x is None else _own(of_x, piece.member)[piece.steps]
@@ -87,9 +89,10 @@ def _all(
 ) -> Tensor:
     """As `perceptrons`; what a gradient needs is appended to `pieces`, if there are any."""
     outputs = x.new_empty(len(weights[0]), x.shape[-2])
-    size = max(1, NUMBERS // max(w.shape[2] for w in weights))
+    size = max(1, NUMBERS // max(w.shape[2] for w in weights))  # by the widest layer, so that a piece stays in cache
     for member, steps in _pieces(len(outputs), x.shape[-2], size):
         piece = _Piece(member, steps, [_own(x, member)[steps]], [])
+        # A view (S, 1) of the result, which the last product writes into: no copy.
         _forward(piece, _layers(weights, biases, member), function, outputs[member, steps, None])
         if pieces is not None:
             pieces.append(piece)
@@ -127,11 +130,12 @@ def _backward(
     """From the gradient of the outputs (S, 1) add those of the layers `into`, and that of the input to `of_input`."""
     for layer in reversed(range(len(weights))):
         of_weight, of_bias = into[layer]
+        # In place and over all pieces: the gradients of a member add up here.
         of_weight.addmm_(piece.inputs[layer].T, gradient)
         of_bias.add_(gradient.sum(0))
         back = weights[layer].T
         if layer:
-            gradient = gradient * back if len(back) == 1 else gradient @ back
-            gradient = function.backward(gradient, piece.activated[layer - 1])
+            gradient = gradient * back if len(back) == 1 else gradient @ back  # (S, 1) x (1, in)
+            gradient = function.backward(gradient, piece.activated[layer - 1])  # overwrites `gradient`, which is ours
         elif of_input is not None:
             of_input.addmm_(gradient, back)

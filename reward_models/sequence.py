@@ -12,11 +12,10 @@ from torch import Tensor
 from torch.nn.functional import gelu, layer_norm, scaled_dot_product_attention
 
 from prefrl.components import ConfigError, Settings
-from prefrl.protocols import Task
+from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.network import CACHED, uniform
-from prefrl.reward_models.steps import StepReward, control
-from prefrl.seeding import draw_seed
+from prefrl.reward_models.steps import CACHED, StepReward, uniform
+from prefrl.seeding import generator
 
 
 class GRUSettings(Settings):
@@ -35,7 +34,7 @@ class GRUSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         network = GRU(self, found.observation_size + found.action_size, self.memory or found.segment_steps, rng)
         return StepReward(network, found, self.gain, self.combine)
 
@@ -44,7 +43,7 @@ class GRU:
     """A `Network`: E gated recurrent units, and a linear output of each step's state."""
 
     def __init__(self, settings: GRUSettings, inputs: int, memory: int, rng: np.random.Generator) -> None:
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        order = generator(rng)
         self.members, self.memory, width = settings.members, memory, settings.width
         self.most = CACHED // self.members
         shapes = {
@@ -55,7 +54,7 @@ class GRU:
             "output_weight": (width, 1),
             "output_bias": (1, 1),
         }
-        self._p = {n: uniform((settings.members, *s), width, generator) for n, s in shapes.items()}
+        self._p = {n: uniform((settings.members, *s), width, order) for n, s in shapes.items()}
 
     def named(self) -> Mapping[str, Tensor]:
         return self._p
@@ -66,22 +65,25 @@ class GRU:
 
     def outputs(self, inputs: Tensor) -> Tensor:
         p, (rows, steps) = self._p, inputs.shape[-3:-1]
+        # (E, T B, I): time comes first, so that unbind(1) below gives one step after another.
         x = inputs.transpose(-3, -2).flatten(-3, -2).expand(self.members, -1, -1)
+        # The inputs' share of all gates at once; only the state's share has to go step by step.
         gates = torch.baddbmm(p["input_bias"], x, p["input_weight"]).view(self.members, steps, rows, -1).unbind(1)
         state, states = inputs.new_zeros(self.members, rows, p["state_weight"].shape[1]), list[Tensor]()
         for gate in gates:
             state = self._step(gate, state)
             states.append(state)
         outputs = torch.baddbmm(p["output_bias"], torch.cat(states, 1), p["output_weight"])
-        return outputs.view(self.members, steps, rows).transpose(1, 2)
+        return outputs.view(self.members, steps, rows).transpose(1, 2)  # (E, T B, 1) -> (E, B, T)
 
     def _step(self, gate: Tensor, state: Tensor) -> Tensor:
         """(E, B, 3 H) of the inputs and (E, B, H) -> the next state."""
         width = state.shape[2]
         own = torch.baddbmm(self._p["state_bias"], state, self._p["state_weight"])
         reset, update = (gate[..., : 2 * width] + own[..., : 2 * width]).sigmoid().chunk(2, -1)
+        # The reset gate is applied after the product, as in cuDNN and torch; Cho et al. apply it before.
         new = torch.tanh(gate[..., 2 * width :] + reset * own[..., 2 * width :])
-        return torch.lerp(new, state, update)
+        return torch.lerp(new, state, update)  # (1 - update) new + update state
 
 
 class PreferenceTransformerSettings(Settings):
@@ -106,7 +108,7 @@ class PreferenceTransformerSettings(Settings):
     """How the members become the one reward that learners optimise."""
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
-        found = control(task, self.kind)
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
         if self.width % self.heads:
             raise ConfigError(f"reward.width must be a multiple of reward.heads, got {self.width} and {self.heads}")
         inputs = found.observation_size + found.action_size
@@ -127,19 +129,19 @@ class PreferenceTransformer:
     def __init__(
         self, settings: PreferenceTransformerSettings, inputs: int, memory: int, rng: np.random.Generator
     ) -> None:
-        generator = torch.Generator().manual_seed(draw_seed(rng))
+        order = generator(rng)
         self.members, self.memory, self.most = settings.members, memory, CACHED // settings.members
         self._heads, self._layers, self._weighted = settings.heads, settings.layers, settings.preference_attention
         width = settings.width
-        self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, generator)}
-        self._linear("input", inputs, width, generator)
+        self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, order)}
+        self._linear("input", inputs, width, order)
         for i in range(settings.layers):
             for name, o, n in (("qkv", width, 3 * width), ("mix", width, width), ("up", width, 4 * width)):
-                self._linear(f"layer_{i}_{name}", o, n, generator)
-            self._linear(f"layer_{i}_down", 4 * width, width, generator)
-        self._linear("output", width, 1, generator)
+                self._linear(f"layer_{i}_{name}", o, n, order)
+            self._linear(f"layer_{i}_down", 4 * width, width, order)
+        self._linear("output", width, 1, order)
         if self._weighted:
-            self._linear("attend", width, 2 * width, generator)
+            self._linear("attend", width, 2 * width, order)
 
     def named(self) -> Mapping[str, Tensor]:
         return self._p
@@ -160,11 +162,12 @@ class PreferenceTransformer:
         if not self._weighted:
             return worth[..., 0]
         q, k = self._apply("attend", x).chunk(2, -1)
+        # The worths (E, B, T, 1) take the place of values: what comes out is their weighted mean, on their own scale.
         return scaled_dot_product_attention(q, k, worth, is_causal=True)[..., 0]
 
-    def _linear(self, name: str, fan_in: int, fan_out: int, generator: torch.Generator) -> None:
+    def _linear(self, name: str, fan_in: int, fan_out: int, order: torch.Generator) -> None:
         """Each layer norm's own gain and shift would be part of the linear layer behind it, and are left to it."""
-        self._p[f"{name}_weight"] = uniform((self.members, fan_in, fan_out), fan_in, generator)
+        self._p[f"{name}_weight"] = uniform((self.members, fan_in, fan_out), fan_in, order)
         self._p[f"{name}_bias"] = torch.nn.Parameter(torch.zeros(self.members, 1, fan_out))
 
     def _apply(self, name: str, x: Tensor) -> Tensor:
@@ -173,7 +176,7 @@ class PreferenceTransformer:
         return flat.view(*x.shape[:3], -1)
 
     def _attention(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        q, k, v = (x.reshape(*x.shape[:3], self._heads, -1).transpose(2, 3) for x in (q, k, v))
+        q, k, v = (x.reshape(*x.shape[:3], self._heads, -1).transpose(2, 3) for x in (q, k, v))  # (E, B, heads, T, D)
         return scaled_dot_product_attention(q, k, v, is_causal=True).transpose(2, 3).flatten(3)
 
 

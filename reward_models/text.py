@@ -13,15 +13,17 @@ from pydantic import Field, model_validator
 from torch import Tensor
 from torch.nn.functional import linear
 
-from prefrl.components import ConfigError, Settings
-from prefrl.protocols import Task, TextTask
+from prefrl.components import Settings
+from prefrl.policies.language import pad_right
+from prefrl.protocols import Task, text
 from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
 from prefrl.reward_models.ensemble import Ensemble, combine
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator, to_numpy
 from prefrl.types import Floats, Response, State
 
 CHUNK = 128
 """Responses scored at once outside a fit: bounds the memory, and lets rows of like length share a pass."""
+NEEDS = "reward kind 'transformer' scores text responses"
 
 
 class TransformerSettings(Settings):
@@ -63,11 +65,14 @@ class TransformerSettings(Settings):
         if self.checkpoint:
             from prefrl.reward_models.io import load_classifier
 
-            return load_classifier(self.checkpoint, _text(task), self, rng)
+            backbone, head = load_classifier(self.checkpoint, text(task, NEEDS), self.download, self.chat_template)
+            reward = TransformerReward(self, backbone, rng)
+            reward.start_from(head)
+            return reward
         if self.backbone:
-            backbone = of_folder(self.backbone, _text(task), self.download, self.pool, bool(self.chat_template))
+            backbone = of_folder(self.backbone, text(task, NEEDS), self.download, self.pool, bool(self.chat_template))
         else:
-            backbone = of_policy(_text(task), bool(self.chat_template))
+            backbone = of_policy(text(task, NEEDS), bool(self.chat_template))
         return TransformerReward(self, backbone, rng)
 
 
@@ -81,12 +86,13 @@ class TransformerReward:
 
     def __init__(self, settings: TransformerSettings, backbone: Backbone, rng: np.random.Generator) -> None:
         self._settings, self.backbone = settings, backbone
-        generator = torch.Generator().manual_seed(draw_seed(rng))
-        heads = torch.randn(settings.members, backbone.width, generator=generator) / math.sqrt(backbone.width + 1)
+        drawn = torch.randn(settings.members, backbone.width, generator=generator(rng))
+        # Over sqrt(d + 1), so that scores do not start further apart the wider the backbone is.
+        heads = drawn / math.sqrt(backbone.width + 1)
         self._heads, self._bias = torch.nn.Parameter(heads), torch.nn.Parameter(torch.zeros(settings.members))
         self._shift, self._scale = torch.zeros(settings.members), torch.ones(settings.members)
         self._fits, self._temperature = 0, 1.0
-        backbone.model.requires_grad_(settings.train == "full")
+        backbone.model.requires_grad_(settings.train == "full")  # before adapters are added, which stay trainable
         if settings.train == "lora":
             from prefrl.reward_models.lora import add_adapters  # peft takes seconds to load
 
@@ -104,6 +110,11 @@ class TransformerReward:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return [*self._trained.values(), self._heads, self._bias]
 
+    def to(self, device: torch.device) -> None:
+        self.backbone.model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
+        for tensor in (self._heads, self._bias, self._shift, self._scale):
+            tensor.data = tensor.data.to(device)
+
     def stack(self, candidates: Sequence[Response]) -> Mapping[str, Tensor]:
         """tokens (N, L) and lengths (N,); where only heads are trained, the backbone's features (N, d) at once.
 
@@ -111,17 +122,18 @@ class TransformerReward:
         """
         if self._settings.train == "head":
             return {"features": self._in_chunks(candidates)}
-        return _padded(self.backbone.rows(candidates))
+        return self._padded(self.backbone.rows(candidates))
 
     def scores(self, stacked: Mapping[str, Tensor]) -> Tensor:
         features = stacked["features"] if "features" in stacked else self._features(stacked)
-        return linear(features, self._heads, self._bias).T
+        return linear(features, self._heads, self._bias).T  # (N, E) -> (E, N)
 
     @torch.no_grad()
     def settle(self, stacked: Mapping[str, Tensor], loss: Callable[[Tensor], Tensor]) -> Tensor:
         count = len(next(iter(stacked.values())))
         parts = [self.scores({k: x[i : i + CHUNK] for k, x in stacked.items()}) for i in range(0, count, CHUNK)]
         scores = torch.cat(parts, 1)
+        # The clamp: all scores may be equal, and rewards must stay finite.
         self._shift, self._scale = scores.mean(1), scores.std(1, correction=0).clamp(min=1e-6)
         self._fits, self._temperature = self._fits + 1, 1.0
         return scores
@@ -134,7 +146,7 @@ class TransformerReward:
         return raw
 
     def member_scores(self, candidates: Sequence[Response]) -> Floats:
-        shift, scale = self._shift.numpy()[:, None], self._scale.numpy()[:, None]
+        shift, scale = to_numpy(self._shift)[:, None], to_numpy(self._scale)[:, None]
         found: Floats = (self._scores_of(candidates) - shift) / scale
         return found
 
@@ -143,8 +155,7 @@ class TransformerReward:
 
     def features(self, candidates: Sequence[Response]) -> Floats:
         """(N, d): what the heads see, of a causal model its state at the last token."""
-        found: Floats = self._in_chunks(candidates).numpy()
-        return found
+        return to_numpy(self._in_chunks(candidates))
 
     def state(self) -> State:
         """What a fit changes; of what it does not change, only a digest."""
@@ -164,7 +175,7 @@ class TransformerReward:
             raise ValueError("reward model: its backbone's frozen weights are others than those it was fitted on")
         for name, parameter in own.items():
             parameter.copy_(found[name])
-        self._shift, self._scale = state["shift"].clone(), state["scale"].clone()
+        self._shift, self._scale = (state[n].to(self._heads.device, copy=True) for n in ("shift", "scale"))
         self._fits, self._temperature = int(state["fits"]), float(state["temperature"])
 
     @torch.no_grad()
@@ -173,11 +184,12 @@ class TransformerReward:
         self._heads.copy_(head.weight)
         if head.bias is not None:
             self._bias.copy_(head.bias)
-        self._fits = 1
+        self._fits = 1  # it scores as it was fitted, so it counts as fitted
 
     @torch.no_grad()
     def mean_head(self) -> tuple[Tensor, float]:
         """The mean of the members' normalised scores is `features @ weight` (d,) plus a constant."""
+        # A mean of linear heads is one linear head, so an ensemble can be exported as a single model.
         weight = (self._heads / self._scale[:, None]).mean(0)
         return weight, float(((self._bias - self._shift) / self._scale).mean())
 
@@ -187,32 +199,26 @@ class TransformerReward:
 
     def _features(self, stacked: Mapping[str, Tensor]) -> Tensor:
         """(N, d) float32."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.precision == "bfloat16"):
+        with torch.autocast(
+            stacked["tokens"].device.type, torch.bfloat16, enabled=self._settings.precision == "bfloat16"
+        ):
+            # Heads and scores in float32: bfloat16 near 1 moves in steps of 1/128, which would make ties.
             return self.backbone.states(stacked["tokens"], stacked["lengths"]).float()
 
     @torch.no_grad()
     def _scores_of(self, candidates: Sequence[Response]) -> Floats:
-        found: Floats = self.scores({"features": self._in_chunks(candidates)}).numpy()
-        return found
+        return to_numpy(self.scores({"features": self._in_chunks(candidates)}))
 
     @torch.no_grad()
     def _in_chunks(self, candidates: Sequence[Response]) -> Tensor:
         """(N, d) features, rows of like length together."""
         rows = self.backbone.rows(candidates)
-        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))
+        order = sorted(range(len(rows)), key=lambda i: len(rows[i]))  # like lengths share a chunk
         chunks = [order[i : i + CHUNK] for i in range(0, len(rows), CHUNK)]
-        features = torch.cat([self._features(_padded([rows[i] for i in chunk])) for chunk in chunks])
-        return features[torch.tensor(order).argsort()]
+        features = torch.cat([self._features(self._padded([rows[i] for i in chunk])) for chunk in chunks])
+        return features[torch.tensor(order, device=features.device).argsort()]
 
-
-def _padded(rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
-    """Right-padded with 0, which is a valid id; lengths say what is real."""
-    width = max(map(len, rows))
-    tokens = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows])
-    return {"tokens": tokens, "lengths": torch.tensor([len(row) for row in rows])}
-
-
-def _text(task: Task) -> TextTask:
-    if task.kind != "text":
-        raise ConfigError(f"reward kind 'transformer' scores text responses, but the task is of kind {task.kind!r}")
-    return task  # type: ignore[return-value]
+    def _padded(self, rows: Sequence[Sequence[int]]) -> dict[str, Tensor]:
+        """Right-padded with 0, which is a valid id; lengths say what is real."""
+        tokens, lengths = pad_right(rows, self._heads.device)
+        return {"tokens": tokens, "lengths": lengths}

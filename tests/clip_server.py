@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from prefrl.label.server.clips import Clips, ClipSettings
+from prefrl.page.clips.queue import Clips, ClipSettings
 
-FAKE = Path(__file__).parent / "label" / "server" / "fake_drawer.py"
+FAKE = Path(__file__).parent / "page" / "clips" / "fake_drawer.py"
 CONFIG = "task: {kind: point, segment_steps: 5, frame_size: 33}\n"
 BYTES = 25
 """Of a clip by the fake drawer."""
@@ -73,7 +73,8 @@ def processes(folder: Path) -> list[int]:
     return [int(line.split()[1]) for line in (folder / "attempts").read_text().splitlines()]
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], bool], seconds: float = 40.0) -> None:
+    """Wait for something; fails where it does not come to pass, on a machine that does other things too."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not come to pass"

@@ -10,7 +10,7 @@ from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import postgres_server
@@ -157,8 +157,7 @@ def reviews_policy(tmp_path_factory: pytest.TempPathFactory, _own_cache: None) -
     """The starting policy of "text/reviews" has been made, which takes minutes, once for all tests."""
 
     def make(folder: Path) -> None:
-        task: Any = Config.load("text/reviews").task
-        task.build()
+        Config.load("text/reviews").build_task()
         folder.mkdir()
 
     runs.made_once(tmp_path_factory, "reviews-policy", make)
@@ -167,8 +166,8 @@ def reviews_policy(tmp_path_factory: pytest.TempPathFactory, _own_cache: None) -
 @pytest.fixture(scope="session")
 def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
     """The text task with a tiny starting policy, cloned once for all tests."""
-    from prefrl.envs.cloning import CloningSettings
     from prefrl.envs.text import ReviewsSettings
+    from prefrl.policies.cloning import CloningSettings
 
     cache = runs.made_once(tmp_path_factory, "models", Path.mkdir)
     cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)

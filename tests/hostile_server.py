@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import resource
 import socket
 import subprocess
@@ -50,6 +51,12 @@ class Child:
         """Bytes of memory in use."""
         text = Path(f"/proc/{self.process.pid}/status").read_text()
         return 1024 * next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+
+    @property
+    def work(self) -> float:
+        """Seconds of a processor that the server has used: unlike the time, they do not hang on what else runs."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def connect(self, seconds: float = 10.0) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=seconds)
@@ -127,8 +134,8 @@ def serve(folder: Path) -> None:
     """Serve until the input ends; everything that can be logged is."""
     from stores import responses
 
-    from prefrl.label.server.site import open_site
-    from prefrl.label.web import WebLabeler, WebSettings
+    from prefrl.label.web import WebSettings, terms_of
+    from prefrl.page.site import Address, open_site
     from prefrl.store import Store
 
     resource.setrlimit(resource.RLIMIT_NOFILE, (FILES, FILES))
@@ -136,7 +143,8 @@ def serve(folder: Path) -> None:
     settings = WebSettings(port=0, name="boss", requests_per_second=1e6, check_share=0, repeat_share=0)
     with Store[Any](folder) as store:
         store.ask(responses(200))
-        site = open_site(WebLabeler(settings, cast(Any, Texts())), store)
+        terms = terms_of(settings, cast(Any, Texts()), fixed=False)
+        site = open_site(store, terms, Address(port=0), settings.name, clips=None)
         told: dict[str, Any] = {"port": int(site.address.rstrip("/").rpartition(":")[2])}
         told["boss"] = site.notes[0].partition("#")[2]
         for name, role in (("ann", "annotator"), ("ben", "annotator"), ("trainer", "trainer")):

@@ -58,6 +58,8 @@ class LinearReward:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return ()
 
+    def to(self, device: torch.device) -> None: ...
+
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: object) -> torch.Tensor:
         raise NotImplementedError
 
@@ -73,6 +75,7 @@ class LinearReward:
     def _one(self, candidate: Candidate, weights: Floats) -> float:
         if isinstance(candidate, Response):
             return float(weights[0] * (len(candidate.tokens) or len(candidate.text)))
+        assert isinstance(candidate, Segment)
         return float((candidate.observations.astype(np.float64) @ weights).sum())
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.label.server import tallies
-from prefrl.label.server.api import AgreementRow
-from prefrl.label.server.ledger import Ledger
-from prefrl.log import row
-from prefrl.resampling import Measured
+from prefrl.page import tallies
+from prefrl.page.api import AgreementRow
+from prefrl.page.ledger import Ledger
+from prefrl.stats.estimates import Estimate
+from prefrl.storage.log import row
 
 NOW = datetime(2026, 3, 1, 12, tzinfo=UTC)
 
@@ -62,7 +62,7 @@ class Made:
         own = rows["person"] == ledger.people.get(name, -1)
         return tallies.person({k: v[own] for k, v in rows.items()}, stands[own], alive[own])
 
-    def agreement(self, rng: np.random.Generator) -> tuple[AgreementRow, dict[int, Measured]]:
+    def agreement(self, rng: np.random.Generator) -> tuple[AgreementRow, dict[int, Estimate]]:
         ledger = self.ledger()
         return tallies.agreement(ledger.rows, ledger.pairs, tallies.stands(ledger), rng)
 

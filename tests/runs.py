@@ -41,7 +41,7 @@ def finish(config: Config, folder: Path) -> None:
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
     """A folder that the first process in need of it makes for all that run these tests. It is to be read alone.
 
-    `.ci/in_memory` names a place for what several runs of pytest share, one after another.
+    `.ci/in_memory --shared` names a place for what several runs of pytest share, one after another.
     """
     base = factory.getbasetemp()
     root = Path(os.environ.get(SHARED) or (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base))

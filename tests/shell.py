@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from prefrl.cli import main
+from prefrl.cli.main import main
 
 
 class Shell:

@@ -8,10 +8,11 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from prefrl.log import row
-from prefrl.projection import dump
+from prefrl.judgements import Choice, Comparison, Ranking, Skip
+from prefrl.storage.log import row
+from prefrl.storage.projection import dump
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Query, Ranking, Response, Skip
+from prefrl.types import Query, Response
 
 
 def responses(count: int, size: int = 2) -> list[Query[Response]]:

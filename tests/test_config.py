@@ -1,12 +1,19 @@
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import yaml
+from other_device import ELSEWHERE, both
 
 from prefrl import Config
-from prefrl.components import ConfigError, settings_class
+from prefrl.components import TABLE, ConfigError, Settings, kinds, settings_class
 from prefrl.config import presets
+from prefrl.protocols import LearnerSettings
 from prefrl.rundir import Run
+from prefrl.store import Store
+from prefrl.types import Segment
 
 TOY = "control/toy"
 
@@ -25,6 +32,50 @@ def test_a_dumped_config_spells_out_every_default(tmp_path: Path) -> None:
     assert data["labeler"].keys() == settings_class("labelers", "oracle").model_fields.keys()
     assert data["labeler"]["mistake_rate"] == 0.0
     assert Config.load(path) == Config.load(TOY)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "discount"),
+    [
+        ("control/toy", ["learner.discount=0.8"], 0.8),
+        ("control/toy", ["learner.kind=sb3", "learner.options={gamma: 0.7}"], 0.7),
+        ("text/toy", [], 1.0),
+    ],
+)
+def test_every_kind_of_learner_says_its_discount(name: str, overrides: list[str], discount: float) -> None:
+    assert Config.load(name, overrides).discount == discount
+
+
+@pytest.mark.parametrize("kind", TABLE["labelers"])
+def test_no_progress_is_drawn_where_people_are_spoken_to(kind: str) -> None:
+    given = {"annotators": [{"name": "ann"}]} if kind == "crowd" else {}
+    assert settings_class("labelers", kind).model_validate(given).asks_people() == (kind in ("terminal", "web"))
+
+
+@pytest.mark.parametrize("kind", kinds("learners"))
+def test_every_learners_settings_fit_their_role(kind: str) -> None:
+    assert isinstance(settings_class("learners", kind)(), LearnerSettings)
+
+
+@pytest.mark.parametrize("kind", TABLE["learners"])
+def test_a_shrunk_learner_can_be_evaluated_at_its_true_size(kind: str) -> None:
+    full = settings_class("learners", kind)()
+    small, true_size = full.shrunk().model_dump(), full.shrunk().with_evaluation_of(full).model_dump()
+    assert small != full.model_dump()
+    evaluation = {name for name in small if name.startswith("evaluation_")}
+    assert {name for name in small if small[name] != true_size[name]} == evaluation
+    assert all(true_size[name] == full.model_dump()[name] for name in evaluation)
+
+
+def test_a_learner_that_does_not_say_its_discount_is_refused_before_it_learns(tmp_path: Path) -> None:
+    class Silent(Settings):
+        """Settings of a learner of somebody's own."""
+
+        kind: str = "silent"
+
+    config = Config.load(TOY).model_copy(update={"learner": Silent()})
+    with Store[Segment](tmp_path) as store, pytest.raises(ConfigError, match="Silent has no `discount`"):
+        config.build(store)
 
 
 def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:
@@ -82,7 +133,8 @@ def test_a_new_kind_drops_the_settings_of_the_old_one() -> None:
         ("learner.learning_rate=fast", "learner.learning_rate: expected number, got 'fast'"),
         ("fitting.weight_decay=adaptiv", "fitting.weight_decay: expected number or 'adaptive', got 'adaptiv'"),
         ("learner.learning_rate=.nan", "learner.learning_rate: expected a finite number, got nan"),
-        ("learner.kind=ppoo", "learner.kind: unknown learner kind 'ppoo'; did you mean 'ppo'?"),
+        ("learner.kind=controll", "learner.kind: unknown learner kind 'controll'; did you mean 'control'?"),
+        ("learner.kind=ppo", "learner.kind: learner kind 'ppo' is now called 'control'"),
         ("loop.lables=3", "loop.lables: unknown setting; did you mean 'labels'?"),
         ("lop.labels=3", "lop: unknown setting; did you mean 'loop'?"),
         ("task=5", "task: expected settings with a kind"),
@@ -120,7 +172,7 @@ def test_an_unknown_preset_gets_the_nearest_name() -> None:
         ("task: [", "not valid YAML"),
         ("just words", "expected settings"),
         ("task: !!python/object/apply:os.system ['true']", "not valid YAML"),
-        ("task: {kind: 'os:system'}\nreward: {kind: mlp}\nlearner: {kind: ppo}", "unknown task kind"),
+        ("task: {kind: 'os:system'}\nreward: {kind: mlp}\nlearner: {kind: control}", "unknown task kind"),
     ],
 )
 def test_a_bad_file_is_refused_and_runs_no_code(tmp_path: Path, text: str, message: str) -> None:
@@ -137,3 +189,17 @@ def test_a_missing_extra_names_the_command_that_installs_it(monkeypatch: pytest.
     monkeypatch.setattr("prefrl.components.import_module", absent)
     with pytest.raises(ConfigError, match=r"pip install 'prefrl\[control\]'"):
         settings_class("learners", "sb3")
+
+
+def test_the_reward_model_follows_the_learner_to_its_device() -> None:
+    config = Config.load(TOY)
+
+    def devices(device: torch.device) -> set[str]:
+        learner: Any = config.learner.model_copy(update={"device": device})
+        task: Any = config.task
+        moved = config.model_copy(update={"learner": learner})
+        model = moved.build_reward(task.build(), np.random.default_rng(0))
+        tensors = [x for x in model.state().values() if isinstance(x, torch.Tensor)]
+        return {x.device.type for x in (*tensors, *model.parameters())}
+
+    assert both(devices) == ({"cpu"}, {ELSEWHERE.type})

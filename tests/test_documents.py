@@ -76,7 +76,7 @@ def serve(command: str, folder: Path) -> None:
         assert line, f"{command}\n{said}"
         said += line
     serving.send_signal(signal.SIGINT)
-    assert serving.wait(30) == 130
+    assert serving.wait(120) == 130
     serving.stdout.close()
 
 

@@ -12,11 +12,12 @@ from runs import tiny
 
 from prefrl import Config
 from prefrl.config import presets
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import Store
 from prefrl.stages import shrink
 from prefrl.store import Store as SQLStore
-from prefrl.types import Answer, Comparison, Query, Ranking, Skip
+from prefrl.types import Query
 
 TOYS = ["control/toy", "text/toy"]
 

@@ -13,18 +13,19 @@ import yaml
 from prefrl import Config
 from prefrl.config import presets
 from prefrl.envs.texts import Texts, TextsSettings
+from prefrl.exchange.layout import Which
+from prefrl.exchange.source import open_judgements
 from prefrl.fit.trainer import NothingToFit
-from prefrl.label.formats import Which
-from prefrl.label.source import open_judgements
+from prefrl.judgements import Ranking
 from prefrl.stages import fit_reward, shrink
 from prefrl.store import Store
-from prefrl.types import Query, Ranking, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 TOY = {
     "task": {"kind": "point"},
     "reward": {"kind": "mlp", "members": 1, "hidden": [8]},
     "fitting": {"epochs": 100, "learning_rate": 0.01},
-    "learner": {"kind": "ppo"},
+    "learner": {"kind": "control"},
 }
 OFFLINE = [name for name in presets() if not Config.load(name).loop.labels]
 
@@ -193,3 +194,19 @@ def test_a_policy_improves_on_a_reward_fitted_from_a_file(tmp_path: Path) -> Non
     assert np.isfinite(metrics["evaluate/learned"])
     assert np.isnan(metrics["evaluate/gold"])
     assert run.summary["gold_after"] is None
+
+
+def test_a_file_is_read_once_and_no_store_is_made_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = rows(tmp_path / "x.jsonl.gz", RANKED | {"labeler": "ann"})
+    read: list[Path] = []
+    whole = Path.open
+
+    def watched(self: Path, *arguments: Any, **named: Any) -> Any:
+        read.extend([self] if self == path else [])
+        return whole(self, *arguments, **named)
+
+    monkeypatch.setattr(Path, "open", watched)
+    monkeypatch.setattr("prefrl.store.Store.__init__", lambda *_, **__: pytest.fail("a store was opened"))
+    fitted, _ = fit_reward(texts_config(), path, tmp_path / "out")
+    assert fitted.metrics["judgements"] > 0
+    assert len(read) == 1

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from prefrl.schema import schema, text
+from prefrl.cli.schema import schema, text
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = (".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed")
-PAGES = "prefrl/label/server/pages"
+PAGES = "prefrl/page"
 
 
 def test_the_shipped_schema_is_up_to_date() -> None:
@@ -60,7 +60,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str
     site = tmp_path_factory.mktemp("site")
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)]
     subprocess.run(install, check=True, capture_output=True)
-    imports = "import sys; sys.path.insert(0, sys.argv.pop(1)); from prefrl import cli"
+    imports = "import sys; sys.path.insert(0, sys.argv.pop(1)); from prefrl.cli import main as cli"
     return [sys.executable, "-c", f"{imports}; print(cli.__file__, flush=True); cli.main()", str(site)]
 
 

@@ -8,11 +8,13 @@ import pytest
 from runs import copied, exit_code, finish, tiny
 
 from prefrl import Config
-from prefrl.checkpoints import load_state
 from prefrl.components import ConfigError
-from prefrl.rundir import Run, RunError, open_saved
+from prefrl.rundir import Run, RunError, open_saved, save_reward
 from prefrl.stages import label, with_reward
+from prefrl.storage.checkpoints import load_state
+from prefrl.storage.files import DamagedError
 from prefrl.store import Store
+from prefrl.types import Segment
 
 TOYS = ["control/toy", "text/toy"]
 SUMMARY = {
@@ -69,21 +71,23 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(
 
 
 DYING = """
-import os, signal, sys, torch
+import itertools, os, signal, sys, torch
 from prefrl import Config, Run
+from prefrl.storage.files import DamagedError
 from prefrl.store import Store
+from prefrl.types import Segment
 
 torch.set_num_threads(1)
 name, folder, moment = sys.argv[1:]
-calls = [0]
+calls = itertools.count(1)
 
 def dying(method, last, after):
     def wrapped(*arguments):
-        calls[0] += 1
-        if calls[0] == last and not after:
+        number = next(calls)  # of this call alone: blobs are filed by several threads at once
+        if number == last and not after:
             os.kill(os.getpid(), signal.SIGKILL)
         method(*arguments)
-        if calls[0] == last:
+        if number == last:
             os.kill(os.getpid(), signal.SIGKILL)
     return wrapped
 
@@ -207,11 +211,24 @@ def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(
         Run(other, tmp_path / "other", first)
 
 
+def test_a_kept_reward_that_was_changed_is_refused(tmp_path: Path) -> None:
+    config, kept = Config.load("control/toy"), tmp_path / "run/reward"
+    with Store[Segment](tmp_path / "other") as store:
+        save_reward(kept, config, config.build(store).reward)
+    (tmp_path / "run/config.yaml").write_text(config.dump())
+    Run(config, tmp_path / "run").close()
+    saved = next(kept.glob("*.safetensors"))
+    data = saved.read_bytes()
+    saved.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(DamagedError, match="it was changed"):
+        Run(config, tmp_path / "run")
+
+
 @pytest.mark.parametrize("name", ["what?", "100%", "a#b", "ü n", "[red]x"])
 def test_a_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
     finish(tiny("control/toy", "loop.rounds=1"), tmp_path / name)
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    with Store(tmp_path / name, write=False) as store:
+    with Store[Any](tmp_path / name, write=False) as store:
         assert store.counts()["answered"] == 24
 
 

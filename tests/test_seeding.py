@@ -1,8 +1,10 @@
 from dataclasses import fields
 
 import numpy as np
+import pytest
+import torch
 
-from prefrl.seeding import Streams, draw_seed, keyed, streams
+from prefrl.seeding import Streams, device_of, draw_seed, generator, keyed, streams, to_numpy
 
 
 def first(rng: np.random.Generator) -> int:
@@ -30,3 +32,31 @@ def test_a_keyed_generator_hangs_on_its_key_alone() -> None:
 
 def test_drawn_seeds_fit_what_libraries_take(rng: np.random.Generator) -> None:
     assert all(0 <= draw_seed(rng) < 2**31 for _ in range(100))
+
+
+def test_auto_is_the_gpu_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for there in (True, False):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        found.append([device_of("auto").type, device_of("cpu").type])
+    assert found == [["cuda", "cpu"], ["cpu", "cpu"]]
+
+
+def test_a_gpu_that_is_asked_for_and_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"learner.device=cuda, but torch finds no GPU: set it to auto or cpu"):
+        device_of("cuda")
+
+
+def test_a_generator_draws_on_the_cpu_whatever_the_default_device_is() -> None:
+    with torch.device("meta"):
+        order = generator(np.random.default_rng(3))
+    assert order.device.type == "cpu"
+    expected = torch.Generator().manual_seed(draw_seed(np.random.default_rng(3)))
+    assert torch.equal(torch.rand(4, generator=order), torch.rand(4, generator=expected))
+
+
+def test_an_array_of_a_parameter_shares_its_memory() -> None:
+    parameter = torch.nn.Parameter(torch.zeros(2))
+    to_numpy(parameter)[1] = 5.0
+    assert parameter.tolist() == [0.0, 5.0]

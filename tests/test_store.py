@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from stores import derived, fill, responses
 
-from prefrl.files import DamagedError
-from prefrl.log import StoreError
-from prefrl.maintenance import backup, verify_store
-from prefrl.projection import dump, rebuild
+from prefrl.judgements import Comparison, Ranking, Skip
+from prefrl.storage.files import DamagedError
+from prefrl.storage.log import StoreError
+from prefrl.storage.maintenance import backup, verify_store
+from prefrl.storage.projection import dump, rebuild
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
 
@@ -169,6 +170,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from typing import Any, cast
+from prefrl.judgements import *
 from prefrl.store import Store
 from prefrl.types import *
 store = Store(Path(sys.argv[1]))

@@ -11,12 +11,11 @@ from typing import Any
 from starlette.testclient import TestClient
 from starlette.types import ASGIApp
 
-from prefrl.label.server import api
-from prefrl.label.server.app import create_app
-from prefrl.label.server.questions import Policy
-from prefrl.label.server.security import Buckets
-from prefrl.label.server.service import Service
-from prefrl.label.server.terms import Terms
+from prefrl.page import api
+from prefrl.page.app import create_app
+from prefrl.page.questions import Policy, Terms
+from prefrl.page.security import Buckets
+from prefrl.page.service import Service
 from prefrl.store import Store
 
 ORIGIN = "http://127.0.0.1:8900"

@@ -1,31 +1,14 @@
-"""Classic control, n environments in one NumPy call: gymnasium's equations, and its states to the bit."""
+"""Classic control as `prefrl.protocols.Dynamics`: gymnasium's equations, and its states to the bit."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from prefrl.protocols import Transition
-from prefrl.types import Floats
-
-Bools = npt.NDArray[np.bool_]
-
-
-class Dynamics(Protocol):
-    """The equations of a simulator whose whole state is an array; pure functions over n environments."""
-
-    def start(self, count: int, rng: np.random.Generator) -> Floats:
-        """(n, S) float64 first states."""
-
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
-        """(n, S), (n, A) -> next states (n, S), rewards (n,), terminated (n,)."""
-
-    def observe(self, states: Floats) -> Floats:
-        """(n, S) -> (n, O) float32."""
+from prefrl.envs.pictures import cartpole, finished, pendulum
+from prefrl.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -36,18 +19,25 @@ class Pendulum:
         high = np.array([np.pi, 1.0])
         return rng.uniform(-high, high, (count, 2))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         angle, velocity = states.T
         # The torque stays float32, as in gymnasium: in float64 the last bits would differ.
         torque = np.clip(actions[:, 0].astype(np.float32), np.float32(-2), np.float32(2))
         wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
         costs = wrapped**2 + 0.1 * velocity**2 + 0.001 * torque**2
+        # Before the angle, which moves by the new velocity, as in gymnasium.
         velocity = np.clip(velocity + (15.0 * np.sin(angle) + 3.0 * torque) * 0.05, -8.0, 8.0)
         return np.stack([angle + velocity * 0.05, velocity], 1), -costs, np.zeros(len(states), bool)
 
     def observe(self, states: Floats) -> Floats:
         angle, velocity = states.T
         return np.stack([np.cos(angle), np.sin(angle), velocity], 1).astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        return finished(pendulum(state, size))
 
 
 @dataclass(frozen=True)
@@ -64,7 +54,7 @@ class CartPole:
     def start(self, count: int, rng: np.random.Generator) -> Floats:
         return rng.uniform(-0.05, 0.05, (count, 4))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         down = self._fallen(states)
         x, velocity, angle, spin = states.T
         force = np.where(actions.argmax(1) == 1, 10.0, -10.0)
@@ -72,6 +62,7 @@ class CartPole:
         push = (force + 0.05 * np.square(spin) * sin) / 1.1
         spin_rate = (9.8 * sin - cos * push) / (0.5 * (4.0 / 3.0 - 0.1 * np.square(cos) / 1.1))
         acceleration = push - 0.05 * spin_rate * cos / 1.1
+        # Each position moves by the old velocity: gymnasium's default is Euler.
         x, velocity = x + 0.02 * velocity, velocity + 0.02 * acceleration
         angle, spin = angle + 0.02 * spin, spin + 0.02 * spin_rate
         following = np.where(down[:, None], states, np.stack([x, velocity, angle, spin], 1))
@@ -82,38 +73,12 @@ class CartPole:
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
 
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        return finished(cartpole(state, size))
+
     def _fallen(self, states: Floats) -> Bools:
         fallen: Bools = (np.abs(states[:, 0]) > 2.4) | (np.abs(states[:, 2]) > 12 * 2 * math.pi / 360)
         return fallen
-
-
-class Vectorised:
-    """n environments of one `Dynamics`; implements `prefrl.protocols.Environments`."""
-
-    def __init__(self, dynamics: Dynamics, count: int, horizon: int) -> None:
-        self._dynamics, self._count, self._horizon = dynamics, count, horizon
-        self._rng = np.random.default_rng(0)
-        self._states: Floats = np.zeros((count, 0))
-        self._elapsed = np.zeros(count, np.int64)
-
-    def reset(self, rng: np.random.Generator) -> Floats:
-        self._rng = rng
-        self._states = self._dynamics.start(self._count, rng)
-        self._elapsed[:] = 0
-        return self._dynamics.observe(self._states)
-
-    def step(self, actions: Floats) -> Transition:
-        states, rewards, terminated = self._dynamics.advance(self._states, actions)
-        self._elapsed += 1
-        truncated = (self._elapsed >= self._horizon) & ~terminated
-        final = observations = self._dynamics.observe(states)
-        ended = terminated | truncated
-        if ended.any():
-            states[ended] = self._dynamics.start(int(ended.sum()), self._rng)
-            self._elapsed[ended] = 0
-            observations = self._dynamics.observe(states)
-        self._states = states
-        return Transition(observations, rewards, terminated, truncated, final)
-
-    def states(self) -> Floats:
-        return self._states

@@ -14,9 +14,8 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from prefrl.envs.fast.classic import Bools
 from prefrl.protocols import Transition
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Locomotion:
         return self._observe()
 
     def step(self, actions: Floats) -> Transition:
-        before = self._states[:, 0].copy()
+        before = self._states[:, 0].copy()  # a copy: _states is written in place
         for i, data in enumerate(self._data):
             self._controls[i][:] = actions[i]
             mujoco.mj_step(self._model, data, nstep=self._frames)
@@ -91,14 +90,18 @@ class Locomotion:
     def states(self) -> Floats:
         return self._states
 
+    def legal(self) -> Bools | None:
+        return None
+
     def _start(self, i: int) -> None:
         data, (qpos, qvel), noise = self._data[i], self._memory[i], self._body.reset_noise
+        # Also clears the solver's warm start: what an episode does must not hang on the one before it.
         mujoco.mj_resetData(self._model, data)
         qpos[:] = self._first[0] + self._rng.uniform(-noise, noise, len(qpos))
         normal = self._body.normal_velocities
         drawn = noise * self._rng.standard_normal(len(qvel)) if normal else self._rng.uniform(-noise, noise, len(qvel))
         qvel[:] = self._first[1] + drawn
-        mujoco.mj_forward(self._model, data)
+        mujoco.mj_forward(self._model, data)  # what is derived from positions and velocities must follow them
         self._elapsed[i] = 0
         self._read(i)
 
@@ -109,6 +112,7 @@ class Locomotion:
 
     def _observe(self) -> Floats:
         """Positions but the first, and clipped velocities."""
+        # A copy, since clipping is in place, and only what is observed is clipped.
         clip, observations = self._body.velocity_clip, self._states[:, 1:].copy()
         velocities = observations[:, self._model.nq - 1 :]
         np.clip(velocities, -clip, clip, out=velocities)

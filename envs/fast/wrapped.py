@@ -11,7 +11,7 @@ import numpy as np
 
 from prefrl.protocols import Transition
 from prefrl.seeding import draw_seed
-from prefrl.types import Floats
+from prefrl.types import Bools, Floats
 
 
 class Wrapped:
@@ -37,14 +37,18 @@ class Wrapped:
         truncated = np.array([bool(s[3]) for s in steps]) & ~terminated
         if self._fixed_horizon and terminated.any():
             raise ValueError(_early_end(self._envs[0]))
-        observations = final.copy()
+        observations = final.copy()  # a reset must not change what the step led to
         for i in np.flatnonzero(terminated | truncated):
-            observations[i] = self._envs[i].reset()[0]
+            observations[i] = self._envs[i].reset()[0]  # without a seed: the generator that `reset` seeded goes on
         return Transition(observations, np.array([float(s[1]) for s in steps]), terminated, truncated, final)
 
     def states(self) -> Floats | None:
         rows = [physics_state(env) for env in self._envs]
         return None if any(row is None for row in rows) else np.array(rows, np.float64)
+
+    def legal(self) -> Bools | None:
+        """gymnasium has no word for moves that are not legal."""
+        return None
 
     def _action(self, env: gymnasium.Env[Any, Any], action: Floats) -> Any:
         if not self._discrete:

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, log_expit, logsumexp
 
-from prefrl.evaluate.card import Bucket, Estimate, LabelerPart, Members, undefined
-from prefrl.evaluate.intervals import share
-from prefrl.raters import cohen
+from prefrl.evaluate.card import Bucket, LabelerPart, Members
+from prefrl.stats.estimates import Estimate, undefined
+from prefrl.stats.intervals import mean
+from prefrl.stats.raters import cohen
 from prefrl.types import Floats, Integers
 
 BUCKETS = 4
@@ -57,6 +58,7 @@ class Pairs:
     @property
     def margin(self) -> Floats:
         """(M,) abs of the logit of `predicted`, right for probabilities that round to 0 or 1 as well."""
+        # (M,) each: sums in place of means over members, whose log E cancels below.
         log_p, log_q = (logsumexp(log_expit(sign * self.logits), axis=0) for sign in (1, -1))
         found: Floats = np.abs(log_p - log_q)
         return found
@@ -68,7 +70,7 @@ class Pairs:
 
     def share(self, hit: Floats, rng: np.random.Generator) -> Estimate:
         """The mean of `hit` (M,) with an interval that knows which comparisons hang together."""
-        return share(hit, self.cluster, rng, self.clusters)
+        return mean(hit, self.cluster, rng, what=self.clusters)
 
 
 def hits(guess: Floats, truth: Floats) -> Floats:
@@ -83,6 +85,7 @@ def buckets(pairs: Pairs, margin: Floats, rng: np.random.Generator, lengths: boo
     some, margin = pairs.take(keep), margin[keep]
     if not len(some):
         return []
+    # An observed value as a border, not one between two: equal margins then fall on one side of it.
     edges = np.unique(np.quantile(margin, np.linspace(0, 1, BUCKETS + 1)[1:-1], method="inverted_cdf"))
     at = np.searchsorted(edges, margin)
     return [_bucket(some.take(at == i), margin[at == i], rng, lengths) for i in np.unique(at)]

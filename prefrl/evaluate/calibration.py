@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from prefrl.stats.estimates import wilson
 from prefrl.types import Floats
 
 
@@ -35,7 +35,7 @@ def reliability(predicted: Floats, preference: Floats, bins: int = 5) -> tuple[B
     turned = predicted < 0.5
     confidence = np.where(turned, 1.0 - predicted, predicted).astype(np.float64)
     won = np.where(turned, 1.0 - preference, preference).astype(np.float64)
-    place = np.minimum((confidence - 0.5) * 2 * bins, bins - 1).astype(int)
+    place = np.minimum((confidence - 0.5) * 2 * bins, bins - 1).astype(int)  # 1.0 belongs to the last bin
     return tuple(_bin(confidence[place == i], won[place == i]) for i in range(bins) if (place == i).any())
 
 
@@ -43,11 +43,3 @@ def _bin(confidence: Floats, won: Floats) -> Bin:
     share = float(won.mean())
     low, high = wilson(share, len(won))
     return Bin(len(won), float(confidence.mean()), share, low, high)
-
-
-def wilson(share: float, count: int, z: float = 1.96) -> tuple[float, float]:
-    """The interval of a proportion (Wilson 1927); honest for small counts, unlike share +- z x error."""
-    centre = share + z * z / (2 * count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    scale = 1 + z * z / count
-    return (centre - half) / scale, (centre + half) / scale

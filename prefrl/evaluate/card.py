@@ -4,32 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-Number = Annotated[float, Field(ge=-1e15, le=1e15)]
-"""Finite, and of a size that can be drawn."""
-Words = Annotated[str, Field(max_length=1000)]
+from prefrl.stats.estimates import Estimate, Number, Part, Words
+
 Points = Annotated[list[Number], Field(max_length=1000)]
-
-
-class Part(BaseModel):
-    """A part of a card. A file that does not fit is refused as a whole."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class Estimate(Part):
-    """A number with its 95 % interval; or no number, and why."""
-
-    value: Number | None = None
-    low: Number | None = None
-    high: Number | None = None
-    count: int = 0
-    """How many comparisons, candidates or steps it rests on."""
-    how: Words = ""
-    """How the interval was made, or why there is none."""
-    why: Words = ""
-    """Why the number itself is not defined."""
 
 
 class Bucket(Part):
@@ -198,7 +177,3 @@ class ReportCard(Part):
     seconds: Estimate
     """To score 1000 candidates."""
     scatter: Scatter
-
-
-def undefined(why: str) -> Estimate:
-    return Estimate(why=why)

@@ -10,8 +10,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from prefrl.evaluate.card import Distance, Estimate, undefined
+from prefrl.evaluate.card import Distance
 from prefrl.protocols import RewardModel, StepRewardModel
+from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Candidate, Floats, Segment
 
 Reward: TypeAlias = Callable[[Floats, Floats, Floats], Floats]
@@ -55,7 +56,7 @@ def pearson_distance(x: Floats, y: Floats) -> float | None:
     """
     if len(x) < 2 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
-    return sqrt(max(0.0, 1.0 - float(np.corrcoef(x, y)[0, 1])) / 2.0)
+    return sqrt(max(0.0, 1.0 - float(np.corrcoef(x, y)[0, 1])) / 2.0)  # rounding can take a correlation above 1
 
 
 def canonical(
@@ -69,7 +70,7 @@ def canonical(
 
     def mean_from(here: Floats) -> Floats:
         means = []
-        for part in np.array_split(here, max(1, len(here) // chunk)):
+        for part in np.array_split(here, max(1, len(here) // chunk)):  # all pairs at once would be n x m rows
             left = np.repeat(part, len(states), 0)
             values = reward(left, np.tile(actions, (len(part), 1)), np.tile(states, (len(part), 1)))
             means.append(values.reshape(len(part), len(states)).mean(1))
@@ -97,6 +98,7 @@ def epic(
     count, means = (min(n, len(steps)) for n in draws)
     at = rng.permutation(len(steps))[:count]
     some = Transitions(steps.observations[at], steps.actions[at], steps.following[at])
+    # Two permutations: together, actions and states would be drawn from the joint distribution, not the product.
     actions, states = (x[rng.permutation(len(steps))[:means]] for x in (steps.actions, steps.observations))
     x, y = (canonical(reward, some, states, actions, discount) for reward in (first, second))
     return pearson_distance(_rounded(x), _rounded(y))
@@ -116,6 +118,7 @@ def regress(segments: Sequence[Segment], rng: np.random.Generator) -> tuple[Rewa
     """
     gold = [np.asarray(s.gold, np.float64) for s in segments]
     inputs = [np.concatenate([s.observations, s.actions], 1).astype(np.float64) for s in segments]
+    # Split by segment: steps of one segment are too alike to be on both sides.
     test, train = np.split(rng.permutation(len(segments)), [max(1, len(segments) // 5)])
     x, y = (np.concatenate([rows[i] for i in train]) for rows in (inputs, gold))
     degree, mean, std = _degree(x.shape[1], len(x)), x.mean(0), x.std(0)
@@ -125,7 +128,7 @@ def regress(segments: Sequence[Segment], rng: np.random.Generator) -> tuple[Rewa
     def features(rows: Floats) -> Floats:
         return monomials((rows - mean) / np.where(std > 1e-9, std, 1.0), degree)
 
-    weights = np.linalg.lstsq(features(x), y, rcond=1e-10)[0]
+    weights = np.linalg.lstsq(features(x), y, rcond=1e-10)[0]  # many products are collinear: the shortest solution
     unseen, seen_as = (np.concatenate([rows[i] for i in test]) for rows in (gold, inputs))
     squares = float(((unseen - unseen.mean()) ** 2).sum())
     explained = 1.0 - float(((unseen - features(seen_as) @ weights) ** 2).sum()) / squares if squares else 0.0
@@ -147,12 +150,12 @@ def _degree(width: int, rows: int) -> int:
 def distance_part(
     reward: RewardModel[Any],
     candidates: Sequence[Candidate],
-    known: Sequence[Segment],
+    known: Sequence[Candidate],
     discount: float,
     rng: np.random.Generator,
 ) -> Distance:
     """How far a learned reward is from the gold of the candidates' steps; `known` helps to guess gold in between."""
-    steps = [c for c in candidates if isinstance(c, Segment) and _has_gold(c)]
+    steps = _with_gold(candidates)
     if not isinstance(reward, StepRewardModel) or len(steps) < FEWEST:
         control = isinstance(candidates[0], Segment)
         none = undefined(f"fewer than {FEWEST} segments with gold" if control else "for control only")
@@ -160,7 +163,8 @@ def distance_part(
     gold = [np.asarray(s.gold, np.float64) for s in steps]
     learned = [reward.rewards(s.observations[None], s.actions[None])[0] for s in steps]
     direct, count = pearson_distance(np.concatenate(learned), np.concatenate(gold)), sum(map(len, gold))
-    stand_in = regress(list({s.id: s for s in [*steps, *filter(_has_gold, known)]}.values()), rng)
+    # By id, since a segment can be among both.
+    stand_in = regress(list({s.id: s for s in [*steps, *_with_gold(known)]}.values()), rng)
     return Distance(
         epic=_epic_part(reward, stand_in, steps, discount, rng),
         direct=_constant() if direct is None else Estimate(value=direct, count=count),
@@ -192,6 +196,11 @@ def _epic_part(
 
 def _constant() -> Estimate:
     return undefined("a reward is the same at every step")
+
+
+def _with_gold(candidates: Sequence[Candidate]) -> list[Segment]:
+    """The segments whose gold is known at every step."""
+    return [c for c in candidates if isinstance(c, Segment) and _has_gold(c)]
 
 
 def _has_gold(segment: Segment) -> bool:

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.evaluate.card import Drift, Estimate, undefined
-from prefrl.evaluate.intervals import correlate
-from prefrl.types import C, Judged
+from prefrl.evaluate.card import Drift
+from prefrl.judgements import Judged
+from prefrl.stats.estimates import Estimate, undefined
+from prefrl.stats.intervals import correlate
+from prefrl.types import C
 
 PROBES = 64
 """How many of the first judged candidates are scored after each fit."""

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 from scipy.special import expit
 
-from prefrl.evaluate.card import Estimate, Invariance, undefined
+from prefrl.evaluate.card import Invariance
 from prefrl.evaluate.lengths import length
-from prefrl.types import Candidate, Floats, Response, Segment
+from prefrl.kinds import kind_of
+from prefrl.stats.estimates import Estimate, undefined
+from prefrl.types import Candidate, Floats
 
 Score: TypeAlias = Callable[[Sequence[Candidate]], Floats]
 """N candidates -> (E, N) raw scores."""
@@ -59,21 +60,7 @@ def _swap(score: Score, candidates: Sequence[Candidate], pairs: Sequence[tuple[i
 
 def _padding(score: Score, probes: Sequence[Candidate]) -> Estimate:
     """Short candidates beside long ones: half of the probes are cut to half of their length."""
-    cut = [_half(c) if i % 2 else c for i, c in enumerate(probes)]
+    cut = [kind_of(c).half(c) if i % 2 else c for i, c in enumerate(probes)]
     if len({length(c) for c in cut}) < 2:
         return undefined("all candidates have one length, and cannot be cut")
     return _largest(score(cut), np.concatenate([score([c]) for c in cut], 1))
-
-
-def _half(candidate: Candidate) -> Candidate:
-    """The first half, at least one step or token; a response without tokens stays as it is."""
-    if isinstance(candidate, Response):
-        return replace(candidate, tokens=candidate.tokens[: max(1, len(candidate.tokens) // 2)])
-    half, states = max(1, len(candidate) // 2), candidate.states
-    return Segment(
-        candidate.observations[:half],
-        candidate.actions[:half],
-        candidate.episode,
-        candidate.start,
-        None if states is None else states[:half],
-    )

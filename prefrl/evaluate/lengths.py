@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from prefrl.evaluate.agreement import Pairs, buckets, hits
-from prefrl.evaluate.card import Lengths, undefined
-from prefrl.evaluate.intervals import correlation
-from prefrl.types import Candidate, Floats, Integers, Response, Segment
+from prefrl.evaluate.card import Lengths
+from prefrl.kinds import kind_of
+from prefrl.stats.estimates import undefined
+from prefrl.stats.intervals import correlation
+from prefrl.types import Candidate, Floats, Integers
 
 MOST = 2000
 """Candidates in a rank correlation."""
@@ -17,9 +19,7 @@ MOST = 2000
 
 def length(candidate: Candidate) -> int:
     """Steps, tokens, or characters of a response that comes without tokens."""
-    if isinstance(candidate, Response):
-        return len(candidate.tokens) or len(candidate.text)
-    return len(candidate)
+    return kind_of(candidate).length(candidate)
 
 
 def length_part(pairs: Pairs, score: Floats, candidates: Sequence[Candidate], rng: np.random.Generator) -> Lengths:
@@ -29,12 +29,12 @@ def length_part(pairs: Pairs, score: Floats, candidates: Sequence[Candidate], rn
     if np.ptp(sizes) == 0:
         same = undefined(f"all candidates have length {sizes[0]:.0f}")
         values = dict.fromkeys(("spearman", "pearson", "baseline", "when_longer", "when_shorter"), same)
-        return Lengths(unit=_unit(candidates), buckets=[], **values)
+        return Lengths(unit=kind_of(candidates[0]).unit(candidates), buckets=[], **values)
     some = pairs.decided
     longer = some.length * (some.preference - 0.5)
     at = sample(len(sizes), rng)
     return Lengths(
-        unit=_unit(candidates),
+        unit=kind_of(candidates[0]).unit(candidates),
         spearman=correlation("spearman", score[at], sizes[at], [contexts[i] for i in at], rng),
         pearson=correlation("pearson", score[at], sizes[at], [contexts[i] for i in at], rng),
         baseline=some.share(hits(some.length, some.preference - 0.5), rng),
@@ -44,16 +44,9 @@ def length_part(pairs: Pairs, score: Floats, candidates: Sequence[Candidate], rn
     )
 
 
-def _unit(candidates: Sequence[Candidate]) -> str:
-    if isinstance(candidates[0], Segment):
-        return "steps"
-    tokens = {bool(c.tokens) for c in candidates if isinstance(c, Response)}
-    return "tokens" if tokens == {True} else "characters" if tokens == {False} else "tokens or characters"
-
-
 def context(candidate: Candidate) -> str:
     """Candidates of one episode, or of one prompt, are resampled together."""
-    return candidate.prompt if isinstance(candidate, Response) else candidate.episode
+    return kind_of(candidate).cluster(candidate)
 
 
 def sample(count: int, rng: np.random.Generator, most: int = MOST) -> Integers:

@@ -19,7 +19,7 @@ from prefrl.fit.noise import Discriminator, flipped
 from prefrl.fit.settings import FittingSettings, check_solved
 from prefrl.fit.terms import Terms
 from prefrl.protocols import RewardModel
-from prefrl.seeding import draw_seed
+from prefrl.seeding import generator
 from prefrl.types import C
 
 RATE = 0.05
@@ -58,21 +58,23 @@ class Problem(Generic[C]):
         """The loss of some training judgements; each candidate among them is scored once."""
         fitting, extra = self.fitting, self._unjudged(part, order)
         mentioned = torch.cat([part.candidates(), extra.flatten()])
-        needed, here = torch.unique(mentioned, return_inverse=True)
+        needed, here = torch.unique(mentioned, return_inverse=True)  # (N',), and where each mention stands in it
         stacked: Mapping[str, Tensor] = {name: x.index_select(0, needed) for name, x in self.stacked.items()}
         if fitting.crop:
             stacked = semi.crop(stacked, fitting.crop, order)
         counts, here_terms = weights(part, weight), part.over(here)
+        # Centring and pseudo-labels look at every member's score of every candidate.
         if not (fitting.centre or len(extra) or counts.all()):
             stacked = {**stacked, "used": _used(here_terms, counts, len(needed))}
         scores = self.reward.scores(stacked)
         loss = weighted_mean(self.likelihood.losses(here_terms, scores), counts)
         if fitting.reliability == "learned":
+            # The loss is a mean over judgements: over all their weights, the prior keeps its size beside it.
             loss = loss + (self.likelihood.prior() / weights(self.train, self.weight).sum(1)).sum()
         if fitting.centre:
-            loss = loss + fitting.centre * scores.mean(1).square().sum()
+            loss = loss + fitting.centre * scores.mean(1).square().sum()  # preferences say nothing of a member's offset
         if len(extra):
-            edges = here[len(mentioned) - extra.numel() :].view(-1, 2)
+            edges = here[len(mentioned) - extra.numel() :].view(-1, 2)  # (U, 2): they were mentioned last
             loss = loss + fitting.pseudo_labels * semi.pseudo_loss(scores, edges, fitting.confidence)
         return loss
 
@@ -82,10 +84,10 @@ class Problem(Generic[C]):
 
     def _unjudged(self, part: Terms, order: torch.Generator) -> Tensor:
         if not self.fitting.pseudo_labels:
-            return torch.zeros(0, 2, dtype=torch.int64)
+            return part.labeler.new_zeros(0, 2)
         judgements = torch.cat([part.choices.judgement, part.ratings.judgement])
         count = UNJUDGED * len(set(judgements.tolist()))
-        return semi.pairs(self.candidates[self.judged :], self.judged, count, order)
+        return semi.pairs(self.candidates[self.judged :], self.judged, count, order).to(part.labeler.device)
 
 
 def optimise(problem: Problem[C], rng: np.random.Generator) -> int:
@@ -107,11 +109,12 @@ class _Descent(Generic[C]):
         adaptive = self.fitting.weight_decay == "adaptive"
         groups: list[dict[str, Any]] = [
             {"params": self.parameters, "weight_decay": DECAY if adaptive else self.fitting.weight_decay},
+            # No decay: it pulls to 0, which is an error rate of a half.
             {"params": problem.likelihood.parameters(), "lr": RATE, "weight_decay": 0.0},
         ]
         groups = [group for group in groups if group["params"]]
         self.optimizer = torch.optim.AdamW(groups, self.fitting.learning_rate, fused=True)
-        self.order = torch.Generator().manual_seed(draw_seed(rng))
+        self.order = generator(rng)
         self.discriminator = Discriminator()
 
     def run(self) -> int:
@@ -119,7 +122,7 @@ class _Descent(Generic[C]):
         measured = bool(len(self.problem.test.labeler))
         patience = self.fitting.patience if measured else 0
         best, epoch, best_epoch = float("inf"), 0, 0
-        kept = self._copies()
+        kept = self._copies()  # also of what is learned beside the reward, which the scores belong to
         while epoch < self.fitting.epochs and (not patience or epoch - best_epoch < patience):
             epoch += 1
             self._epoch()
@@ -133,8 +136,9 @@ class _Descent(Generic[C]):
 
     def _epoch(self) -> None:
         train, weight = self._trusted()
-        order = torch.randperm(len(train.labeler), generator=self.order)
+        order = torch.randperm(len(train.labeler), generator=self.order).to(weight.device)
         for part in train.minibatches(order, self.fitting.batch_size):
+            # One generator for the order, for crops and for pseudo-labels: one seed repeats the fit.
             self._step(self.problem.loss(part, weight, self.order))
 
     def _trusted(self) -> tuple[Terms, Tensor]:
@@ -143,7 +147,7 @@ class _Descent(Generic[C]):
         if self.fitting.denoise == "off":
             return problem.train, problem.weight
         sums, counts = per_judgement(problem.train, _beside_ignorance(problem, problem.train)[None])
-        pairs = torch.tensor(self.fitting.denoise == "flip") & _is_pair(problem.train, counts)
+        pairs = _is_pair(problem.train, counts) & (self.fitting.denoise == "flip")
         verdict, self.discriminator = self.discriminator.judge(sums[0] / counts, pairs)
         return flipped(problem.train, verdict.flip), problem.weight * verdict.keep
 
@@ -151,8 +155,9 @@ class _Descent(Generic[C]):
         for parameter in self._all():
             parameter.grad = None
         loss.backward()  # type: ignore[no-untyped-call]
+        # The reward's alone: a tie or an error rate has few gradients, on another scale.
         norm = _shorten([p.grad for p in self.parameters if p.grad is not None], self.fitting.max_grad_norm)
-        if not math.isfinite(norm):
+        if not math.isfinite(norm):  # before the step, which would spread it over all weights
             raise FloatingPointError(
                 f"the gradient of the reward model's loss is {norm}, and the loss {float(loss.detach())}: "
                 "lower fitting.learning_rate"
@@ -190,15 +195,17 @@ def _alternate(problem: Problem[C]) -> None:
     for _ in range(ALTERNATIONS if own else 0):
         scores = problem.reward.settle(problem.stacked, problem.total)
         _minimise(partial(_own_loss, problem, scores), own)
-        problem.reward.load(before)
+        problem.reward.load(before)  # to settle counts as a fit, and the one that counts comes later
 
 
 def _used(part: Terms, counts: Tensor, candidates: int) -> Tensor:
     """(N, E) bool: which candidates stand in a term that counts (E, S + R) for that member."""
     count, width = part.choices.items.shape
     counted = counts.bool()
+    # (E, S K + R), in the order of `candidates()`: a choice mentions K.
     mentions = torch.cat([counted[:, :count].repeat_interleave(width, 1), counted[:, count:]], 1)
-    used = torch.zeros(candidates, len(counts))
+    used = counts.new_zeros(candidates, len(counts))
+    # Added up, not assigned: of several mentions of a candidate the last one would win.
     return used.index_add_(0, part.candidates(), mentions.T.float()).bool()
 
 
@@ -239,7 +246,7 @@ def ensemble_losses(problem: Problem[C], part: Terms, scores: Tensor | None = No
         stacked = {name: x.index_select(0, needed) for name, x in problem.stacked.items()}
         part, scores = part.over(here), all_scores(problem.reward, stacked)
     losses = problem.likelihood.losses(part, scores)
-    return math.log(len(losses)) - (-losses).logsumexp(0)
+    return math.log(len(losses)) - (-losses).logsumexp(0)  # -log of the mean over members of exp(-loss)
 
 
 def ensemble_loss(problem: Problem[C], part: Terms, scores: Tensor | None = None) -> float:
@@ -253,12 +260,13 @@ def _beside_ignorance(problem: Problem[C], part: Terms) -> Tensor:
 
     So the best of eight is no more suspect than the better of two, before anything is known.
     """
-    blank = ensemble_losses(problem, part, torch.zeros(problem.reward.members, len(problem.candidates)))
+    blank = ensemble_losses(problem, part, problem.weight.new_zeros(problem.reward.members, len(problem.candidates)))
+    # The clamp: where ties are expected anyway, a term can be all but certain before anything is known.
     return ensemble_losses(problem, part) * (math.log(2) / blank.clamp(min=1e-3))
 
 
 def _is_pair(part: Terms, terms: Tensor) -> Tensor:
     """(J,) whether a judgement is a single comparison of two that prefers one."""
-    two = torch.zeros(len(terms), dtype=torch.bool)
+    two = terms.new_zeros(len(terms), dtype=torch.bool)
     two[part.choices.judgement[(part.choices.present.sum(1) == 2) & ~part.choices.tied]] = True
     return two & (terms == 1)

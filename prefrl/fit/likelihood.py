@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
 
 from prefrl.fit import losses
 from prefrl.fit.metrics import Answering
-from prefrl.fit.terms import Choices, Ratings, Terms, Ties
+from prefrl.fit.settings import Reliability, Ties
+from prefrl.fit.terms import Choices, Ratings, Terms
+from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Metrics
 
-Reliability: TypeAlias = Literal["alike", "learned"]
 START = 0.1
 """The error rate that a labeler is taken to have before anything is learned; below chance, or signs could turn."""
 PRIOR = 1.0
@@ -30,11 +30,13 @@ class Likelihood:
     def __init__(self, members: int, terms: Terms, ties: Ties, error_rate: float, reliability: Reliability) -> None:
         self._ties: Ties = ties if terms.choices.tied.any() else "half"  # without ties, the limit that none are called
         self._error_rate, self._labelers = error_rate, terms.labelers
-        self.tie = torch.zeros(members, requires_grad=self._ties != "half")
-        self.first_threshold = torch.full((members, 1), -1.0, requires_grad=terms.scale > 0)
-        self.gaps = torch.zeros(members, max(terms.scale - 2, 0), requires_grad=terms.scale > 2)
-        start = math.log(START / (1 - START))
-        self.errors = torch.full((members, len(terms.labelers)), start, requires_grad=reliability == "learned")
+        where, start = terms.labeler.device, math.log(START / (1 - START))
+        self.tie = torch.zeros(members, device=where, requires_grad=self._ties != "half")
+        # Logarithms of the gaps, so that thresholds increase whatever values these take.
+        self.first_threshold = torch.full((members, 1), -1.0, device=where, requires_grad=terms.scale > 0)
+        self.gaps = torch.zeros(members, max(terms.scale - 2, 0), device=where, requires_grad=terms.scale > 2)
+        shape, learned = (members, len(terms.labelers)), reliability == "learned"
+        self.errors = torch.full(shape, start, device=where, requires_grad=learned)
 
     def parameters(self) -> list[Tensor]:
         """What is learned beside the reward; empty where judgements need nothing."""
@@ -50,7 +52,8 @@ class Likelihood:
     def prior(self) -> Tensor:
         """(E,) negative log-density of the learned error rates' prior, in judgements' worth of nats."""
         if not self.errors.requires_grad:
-            return torch.zeros(len(self.errors))
+            return self.errors.new_zeros(len(self.errors))
+        # log(1 - e) + log e: a right answer and a wrong one.
         both = torch.nn.functional.logsigmoid(self.errors) + torch.nn.functional.logsigmoid(-self.errors)
         return -PRIOR * both.sum(1)
 
@@ -66,11 +69,12 @@ class Likelihood:
 
     def answering(self, terms: Terms) -> Answering:
         """How scores become answers of two, with the error of each judgement (J,) in the members' mean."""
-        tie: Floats | float = self._natural_tie().double().numpy()[:, None] if self.tie.requires_grad else 0.0
+        tie: Floats | float = to_numpy(self._natural_tie().double())[:, None] if self.tie.requires_grad else 0.0
         outcomes = 2 if self._ties == "half" else 3
-        blind = torch.tensor(self._error_rate * (outcomes - 1) / outcomes)
+        blind = self.errors.new_tensor(self._error_rate * (outcomes - 1) / outcomes)
+        # (E, labelers) -> (J,): the labeler's rate at each of their judgements.
         rates = self.errors.detach().sigmoid() if self.errors.requires_grad else blind.expand_as(self.errors)
-        return Answering(self._ties, tie, rates.mean(0)[terms.labeler].double().numpy())
+        return Answering(self._ties, tie, to_numpy(rates.mean(0)[terms.labeler].double()))
 
     def _natural_tie(self) -> Tensor:
         """(E,) nu, or the threshold."""
@@ -83,7 +87,7 @@ class Likelihood:
         return torch.cat([self.first_threshold, self.first_threshold + self.gaps.exp().cumsum(1)], 1)
 
     def _choices(self, rows: Choices, scores: Tensor, labeler: Tensor) -> Tensor:
-        found = scores[:, rows.items]
+        found = scores[:, rows.items]  # (E, S, K)
         if not rows.pairs:
             found = found.masked_fill(~rows.present, -torch.inf)
         error = self._error(rows, labeler)
@@ -110,7 +114,7 @@ class Likelihood:
         if self._error_rate == 0.0:
             return 0.0
         outcomes = self._outcomes(rows)
-        blind: Tensor = self._error_rate * (outcomes - 1) / outcomes
+        blind: Tensor = self._error_rate * (outcomes - 1) / outcomes  # a blind answer is right once in n
         return blind[None]
 
 
@@ -123,5 +127,5 @@ def weights(terms: Terms, of_judgement: Tensor) -> Tensor:
 def per_judgement(terms: Terms, values: Tensor) -> tuple[Tensor, Tensor]:
     """(E, S + R) values -> (E, J) sums of the terms of each judgement, and (J,) how many terms there are."""
     at = torch.cat([terms.choices.judgement, terms.ratings.judgement])
-    sums = torch.zeros(len(values), len(terms.labeler)).index_add(1, at, values)
+    sums = values.new_zeros(len(values), len(terms.labeler)).index_add(1, at, values)
     return sums, at.bincount(minlength=len(terms.labeler))

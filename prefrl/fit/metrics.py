@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.special import log_expit, logsumexp
 
+from prefrl.fit.settings import Ties
 from prefrl.types import Floats, Integers
-
-if TYPE_CHECKING:
-    from prefrl.fit.terms import Ties
 
 HOTTEST = 10.0
 CERTAINTY = 0.5
@@ -42,7 +39,7 @@ def calibration_error(predicted: Floats, preference: Floats, bins: int = 10) -> 
     p, y = np.concatenate([predicted, 1 - predicted]), np.concatenate([preference, 1 - preference])
     if not len(p):
         return float("nan")
-    at = np.minimum((p * bins).astype(int), bins - 1)
+    at = np.minimum((p * bins).astype(int), bins - 1)  # 1.0 belongs to the last bin
     gaps = [abs(float((p[at == b] - y[at == b]).mean())) * float((at == b).mean()) for b in np.unique(at)]
     return float(sum(gaps))
 
@@ -68,8 +65,9 @@ class Answering:
 
     def log_expected(self, logits: Floats) -> Floats:
         """Its logarithm, finite however sure the members are."""
-        felt = logsumexp(self._log_felt(logits), axis=0) - math.log(len(logits))
+        felt = logsumexp(self._log_felt(logits), axis=0) - math.log(len(logits))  # log of the members' mean probability
         outcomes = 2 if self.ties == "half" else 3
+        # An error e is a blind answer with probability e n / (n - 1), and blind answers come to a half on average.
         blind = self.error * outcomes / (outcomes - 1) * np.ones(len(felt))
         p = np.exp(felt)
         found: Floats = np.where(blind == 0, felt, np.log(np.maximum(p + blind * (0.5 - p), np.finfo(np.float64).tiny)))
@@ -78,11 +76,13 @@ class Answering:
     def _log_felt(self, logits: Floats) -> Floats:
         if self.ties == "rao_kupper":
             wins, loses = log_expit(logits - self.tie), log_expit(-logits - self.tie)
+            # A tie counts half: its probability is P(first) P(second) (exp(2 threshold) - 1), see `losses.rao_kupper`.
             tied: Floats = np.logaddexp(wins, wins + loses + np.log(np.expm1(2 * self.tie) / 2))
             return tied
         if self.ties == "half":
             felt: Floats = log_expit(logits)
             return felt
+        # Over the geometric mean of both scores: weights exp(d / 2), exp(-d / 2), and nu for the tie.
         first, tie = logits / 2, np.log(self.tie)
         norm = np.logaddexp(np.logaddexp(first, -first), tie)
         davidson: Floats = np.logaddexp(first, tie - math.log(2)) - norm

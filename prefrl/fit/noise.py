@@ -47,17 +47,20 @@ class Discriminator:
         """
         spread = max(LEAST_SPREAD, SPREAD - (SPREAD - LEAST_SPREAD) * self.epochs / DECAY)
         deviation = float(loss.std(correction=0)) if len(loss) else 0.0
+        # The spread term is capped: with a few absurd losses the deviation alone would let everything through.
         bound = -math.log(self.ceiling + 1e-8) + SHARE * self.ceiling + min(spread * deviation, MOST_SPREAD)
         trusted, flip = loss < bound, (loss > TURNED) & pairs
         ceiling = self.ceiling
         if trusted.any():
             ceiling = KEEP * ceiling + (1 - KEEP) * float(loss[trusted].max())
+        # What is turned round is used as well.
         return Verdict(trusted | flip, flip), Discriminator(self.epochs + 1, ceiling)
 
 
 def flipped(terms: Terms, flip: Tensor) -> Terms:
     """The terms with the pairs of some judgements (J,) turned round."""
     choices = terms.choices
+    # (S, K): the two of a pair stand first, the rest fills the row.
     turned = torch.cat([choices.target[:, :2].flip(1), choices.target[:, 2:]], 1)
     target = torch.where(flip[choices.judgement][:, None], turned, choices.target)
     return replace(terms, choices=replace(choices, target=target))

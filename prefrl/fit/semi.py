@@ -10,9 +10,8 @@ from torch import Tensor
 
 from prefrl.components import ConfigError
 from prefrl.fit.losses import choice
+from prefrl.fit.settings import NO_CROP
 from prefrl.types import C
-
-NO_CROP = "fitting.crop: only segments can be cropped; set it to 0 for text"
 
 
 def pairs(candidates: Sequence[C], first: int, count: int, order: torch.Generator) -> Tensor:
@@ -26,6 +25,7 @@ def pairs(candidates: Sequence[C], first: int, count: int, order: torch.Generato
     groups = [group for group in by_context.values() if len(group) > 1]
     if not groups or count <= 0:
         return torch.zeros(0, 2, dtype=torch.int64)
+    # A context by how many candidates it has, so that each candidate is as likely as any other.
     sizes = torch.tensor([len(group) for group in groups], dtype=torch.float64)
     picked = torch.multinomial(sizes, count, replacement=True, generator=order).tolist()
     drawn = [torch.randperm(len(groups[g]), generator=order)[:2].tolist() for g in picked]
@@ -38,8 +38,8 @@ def pseudo_loss(scores: Tensor, edges: Tensor, confidence: float) -> Tensor:
     A pair is labelled, with the ensemble's favourite, where its mean probability is above `confidence`; the others
     count nothing, and the mean is over all of them, as in the paper.
     """
-    found = scores[:, edges]
-    probability = found.detach().softmax(-1).mean(0)
+    found = scores[:, edges]  # (E, U, 2)
+    probability = found.detach().softmax(-1).mean(0)  # a label is not to be bent towards the score
     best = probability.max(-1)
     target = torch.nn.functional.one_hot(best.indices, 2).to(scores.dtype)
     sure = (best.values > confidence).to(scores.dtype)
@@ -57,7 +57,8 @@ def crop(stacked: Mapping[str, Tensor], share: float, order: torch.Generator) ->
     count, steps = stacked["inputs"].shape[:2]
     shortest = max(1, round(steps * (1 - share)))
     length = int(torch.randint(shortest, steps + 1, (), generator=order))
-    places = (stacked["mask"].sum(1) - length).clamp(min=0).long() + 1
-    begin = (torch.rand(count, generator=order) * places).long()[:, None]
-    rows, columns = torch.arange(count)[:, None], begin + torch.arange(length)
-    return {name: x[rows, columns] for name, x in stacked.items()}
+    places = (stacked["mask"].sum(1) - length).clamp(min=0).long() + 1  # (N,): the last place is one of them
+    begin = (torch.rand(count, generator=order).to(places.device) * places).long()[:, None]  # (N, 1)
+    rows, columns = (torch.arange(n, device=places.device) for n in (count, length))
+    # (N, T, ...) -> (N, length, ...), the mask too
+    return {name: x[rows[:, None], begin + columns] for name, x in stacked.items()}

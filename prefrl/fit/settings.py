@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
-from prefrl.fit.likelihood import Reliability
-from prefrl.fit.semi import NO_CROP
-from prefrl.fit.terms import Rankings, Ties
+from prefrl.kinds import named
+
+Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
+Rankings: TypeAlias = Literal["plackett_luce", "pairs"]
+Reliability: TypeAlias = Literal["alike", "learned"]
+NO_CROP = "fitting.crop: only segments can be cropped; set it to 0 for text"
 
 
 class FittingSettings(Settings):
@@ -76,7 +79,7 @@ def check_settings(fitting: FittingSettings, solved: bool, kind: str, candidates
     """
     if solved:
         check_solved(fitting)
-    if fitting.crop and kind == "text":
+    if fitting.crop and not named(kind).stepwise:
         raise ConfigError(NO_CROP)
     if fitting.ties == "rao_kupper" and fitting.rankings != "pairs" and candidates > 2:
         raise ConfigError(

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from prefrl.graph import implied_pairs
-from prefrl.types import C, Judged, Rating
+from prefrl.judgements import Judged, Rating, implied_pairs
+from prefrl.types import C
 
 
 def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:
@@ -24,8 +24,10 @@ def split(judged: Sequence[Judged[C]], share: float) -> npt.NDArray[np.bool_]:
     if not share:
         return np.zeros(len(judged), bool)
     component = _components(judged)
+    # `first` is the oldest judgement of each: they stand in the order in which they were given.
     _, first, sizes = np.unique(component, return_index=True, return_counts=True)
     small = first[2 * sizes <= len(judged)]
+    # Ids are sha256, so their first 32 bits are an even draw that every later split repeats.
     chosen = [component[i] for i in small if int(judged[i].query.id[:8], 16) < share * 2**32]
     held_out = np.isin(component, chosen)
     rest = [one for one, out in zip(judged, held_out, strict=True) if not out]
@@ -47,7 +49,7 @@ def _components(judged: Sequence[Judged[C]]) -> npt.NDArray[np.integer]:
     """(J,) which connected component of the graph of candidates each judgement lies in."""
     index: dict[str, int] = {}
     at = [[index.setdefault(c.id, len(index)) for c in one.query.candidates] for one in judged]
-    links = [(row[0], other) for row in at for other in row]
+    links = [(row[0], other) for row in at for other in row]  # a star for each query connects its candidates
     first, second = zip(*links, strict=True)
     graph = coo_array((np.ones(len(links)), (first, second)), shape=(len(index), len(index)))
     _, component = connected_components(graph, directed=False)

@@ -7,19 +7,18 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.graph import implied_pairs
-from prefrl.types import C, Choice, Comparison, Judged, Judgement, Ranking, Rating, person
+from prefrl.fit.settings import Rankings, Ties
+from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating, implied_pairs, person
+from prefrl.types import C
 
-Ties: TypeAlias = Literal["half", "davidson", "rao_kupper"]
 MOST_TIED = 10
 """Sets of so many candidates are a thousand terms."""
-Rankings: TypeAlias = Literal["plackett_luce", "pairs"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +73,14 @@ class Terms:
     scale: int
     """Levels of the ratings, 0 where there are none."""
 
+    def to(self, device: torch.device) -> Terms:
+        """The same terms on a device."""
+        choices, ratings = _moved(self.choices, device), _moved(self.ratings, device)
+        return replace(self, choices=choices, ratings=ratings, labeler=self.labeler.to(device))
+
     def subset(self, keep: Tensor) -> Terms:
         """The terms of the judgements where `keep` (J,) is true, which are counted anew."""
-        number = keep.cumsum(0) - 1
+        number = keep.cumsum(0) - 1  # (J,): what the judgements that are kept are counted as
         choices, ratings = (
             _take(self.choices, keep[self.choices.judgement]),
             _take(self.ratings, keep[self.ratings.judgement]),
@@ -104,8 +108,8 @@ class Terms:
 
     def minibatches(self, order: Tensor, size: int) -> Iterator[Terms]:
         """These terms, `size` judgements at a time, in the order of a permutation of the judgements (J,)."""
-        place = torch.empty_like(order)
-        place[order] = torch.arange(len(order))
+        place = torch.empty_like(order)  # (J,): the inverse permutation
+        place[order] = torch.arange(len(order), device=order.device)
         count = math.ceil(len(order) / size)
         choices = _partition(self.choices, place[self.choices.judgement] // size, count)
         ratings = _partition(self.ratings, place[self.ratings.judgement] // size, count)
@@ -176,7 +180,7 @@ def stages(judgement: Judgement, size: int, ties: Ties, rankings: Rankings) -> l
         return []
     if rankings == "pairs":
         pairs = implied_pairs(judgement, size)
-        share = weight * (size - 1) / len(pairs)
+        share = weight * (size - 1) / len(pairs)  # together they weigh as much as the stages of the ranking
         return [Stage((i, j), (p, 1 - p), p == 0.5, share) for i, j, p in pairs]
     return [stage for group, worse in _groups(judgement) for stage in _group_stages(group, worse, weight, ties)]
 
@@ -198,6 +202,7 @@ def _group_stages(group: list[int], worse: list[int], weight: float, ties: Ties)
     for left in range(len(group), 0, -1):
         for part in combinations(group, left):
             if left + len(worse) > 1:
+                # In all orders of the group, every part of this size is what is left equally often.
                 yield _stage(part, worse, weight / math.comb(len(group), left))
 
 
@@ -217,7 +222,7 @@ def _choices(judged: Sequence[Judged[C]], index: dict[str, int], ties: Ties, ran
 
 def _stacked(rows: Sequence[tuple[list[int], Stage, int]], width: int) -> Choices:
     """(candidates, stage, judgement) -> tensors, each row filled up to `width`."""
-    items = [[*at, *[at[0]] * (width - len(at))] for at, _, _ in rows]
+    items = [[*at, *[at[0]] * (width - len(at))] for at, _, _ in rows]  # any valid index; `present` hides it
     target = [[*stage.target, *[0.0] * (width - len(at))] for at, stage, _ in rows]
     sizes = _tensor([len(at) for at, _, _ in rows], np.int64)
     return Choices(
@@ -247,6 +252,10 @@ def _ratings(judged: Sequence[Judged[C]], index: dict[str, int]) -> Ratings:
     return Ratings(items, level, torch.tensor(columns[2], dtype=torch.float32), judgement)
 
 
+def _moved(rows: Rows, device: torch.device) -> Rows:
+    return type(rows)(*(getattr(rows, field.name).to(device) for field in fields(rows)))
+
+
 def _take(rows: Rows, at: Tensor) -> Rows:
     return type(rows)(*(getattr(rows, field.name)[at] for field in fields(rows)))
 
@@ -254,4 +263,5 @@ def _take(rows: Rows, at: Tensor) -> Rows:
 def _partition(rows: Rows, part: Tensor, count: int) -> list[Rows]:
     """The rows of each of `count` parts, by the part (S,) that each belongs to."""
     sizes: list[int] = part.bincount(minlength=count).tolist()
+    # Stable: the rows of a part keep their order, so that sums over them round the same way each time.
     return [_take(rows, at) for at in torch.split(part.argsort(stable=True), sizes)]

@@ -13,12 +13,14 @@ from prefrl.fit.descent import Problem, all_scores, ensemble_loss, optimise, tra
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.losses import preference_logits
 from prefrl.fit.metrics import accuracy, brier, calibration_error, temperature
+from prefrl.fit.pairs import Batch, compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
-from prefrl.graph import Batch, compared
-from prefrl.protocols import RewardModel, Store
-from prefrl.types import C, Fitted, Floats, Judged, Metrics
+from prefrl.judgements import Judged
+from prefrl.protocols import Judgements, RewardModel
+from prefrl.seeding import to_numpy
+from prefrl.types import C, Fitted, Floats, Metrics
 
 
 class NothingToFit(ValueError):
@@ -27,7 +29,7 @@ class NothingToFit(ValueError):
 
 def fit(
     reward: RewardModel[C],
-    store: Store[C],
+    store: Judgements[C],
     fitting: FittingSettings,
     rng: np.random.Generator,
     unjudged: Sequence[C] = (),
@@ -37,6 +39,7 @@ def fit(
     `unjudged` candidates are for pseudo-labels; open queries give some too. Raises `NothingToFit` where there is no
     judgement, or only ties.
     """
+    # Taken first: what people answer from here on is left to the next fit, and this one can be repeated.
     snapshot = store.sequence
     if fitting.pseudo_labels:
         waiting: list[C] = [c for query in store.open_queries() for c in query.candidates]
@@ -65,7 +68,7 @@ def fit_judged(
         _check_inputs(problem)
     try:
         epochs = optimise(problem, rng)
-    except FloatingPointError:
+    except FloatingPointError:  # name the candidate, where one is to blame
         _check_finite(all_scores(reward, problem.stacked), problem.candidates)
         _check_inputs(problem)
         raise
@@ -85,20 +88,24 @@ def _problem(
     """Everything that a fit needs, stacked once."""
     known: dict[str, C] = {c.id: c for one in judged for c in one.query.candidates}
     others: dict[str, C] = {c.id: c for c in unjudged if c.id not in known}
+    # The judged ones first, in the order of `known`: the terms below count them so.
     candidates: list[C] = list(known.values()) + (list(others.values()) if fitting.pseudo_labels else [])
     every = terms(judged, list(known), fitting.ties, fitting.rankings)
-    out = torch.as_tensor(held_out)
+    stacked = reward.stack(candidates)
+    device = next(iter(stacked.values())).device  # where the reward model is, the whole fit is
+    every, out = every.to(device), torch.as_tensor(held_out, device=device)
     train, descends = every.subset(~out), bool(trainable(reward))
+    resampled = _member_weights(train, reward.members, fitting.bootstrap and descends, rng)
     return Problem(
         reward=reward,
         candidates=candidates,
         judged=len(known),
-        stacked=reward.stack(candidates),
+        stacked=stacked,
         every=every,
         train=train,
         test=every.subset(out),
         likelihood=Likelihood(reward.members, every, fitting.ties, fitting.error_rate, fitting.reliability),
-        weight=_member_weights(train, reward.members, fitting.bootstrap and descends, rng),
+        weight=resampled,
         fitting=fitting,
     )
 
@@ -107,6 +114,7 @@ def _finish(problem: Problem[C], data: Batch[C], out: np.ndarray, scores: Tensor
     """Measure a fit, and calibrate the model."""
     test, logits = data.subset(out), _logits(scores, data.subset(out))
     answering = problem.likelihood.answering(problem.every)
+    # On what was held out: on the training judgements a network is always surer than it may be.
     heat = temperature(logits, test.preference, answering.of(test.group), test.weight)
     problem.reward.calibrate(heat)
     metrics = {
@@ -127,13 +135,15 @@ def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.G
     """(E, J) how often each judgement counts: once, or as the bootstrap draws it for each member."""
     count = len(part.labeler)
     if not bootstrap or members == 1:
-        return torch.ones(members, count)
-    return torch.as_tensor(rng.multinomial(count, np.full(count, 1 / count), size=members), dtype=torch.float32)
+        return torch.ones(members, count, device=part.labeler.device)
+    # Draws with replacement, as counts: every member sees the same minibatches, and weighs them in its own way.
+    drawn = rng.multinomial(count, np.full(count, 1 / count), size=members)
+    return torch.as_tensor(drawn, dtype=torch.float32, device=part.labeler.device)
 
 
 def _logits(scores: Tensor, data: Batch[C]) -> Floats:
     """(E, M): how much better each member finds the first candidate of each comparison."""
-    found: Floats = preference_logits(scores, data.edges).double().numpy()
+    found: Floats = to_numpy(preference_logits(scores, data.edges).double())
     return found
 
 

@@ -1,48 +1,47 @@
-"""Our own policy gradients for control: REINFORCE with a baseline ... PPO, on the learned reward."""
+"""Our own policy gradients for on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
+
+Variant: PPO's clip with GAE (Schulman et al. 2016, 2017), advantages whitened over the rollout, a learning rate steered
+by the KL in place of early stopping, and extra epochs for the critic after each fit of the reward. Values are not
+clipped; actor and critic share nothing but the observation normaliser.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from prefrl.components import Settings
-from prefrl.improve.objectives import (
-    clipped_surrogate,
-    gae,
-    log_ratio,
-    masked_mean,
-    masked_whiten,
-    policy_gradient,
-    value_loss,
-)
-from prefrl.improve.policy import Policy
-from prefrl.improve.rollout import (
-    Rollout,
-    collect,
-    control,
-    cut,
-    evaluation,
-    first_rollout,
-    joined,
-    learned_rewards,
-    step_rewards,
-    whole_episodes,
-)
-from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task
+from prefrl.components import Settings, filled_in
+from prefrl.evaluate.policies import evaluation
+from prefrl.improve.gradient import Batch, Objective, adam, steer, update
+from prefrl.improve.objectives import gae, masked_whiten
+from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
+from prefrl.sample.segments import cut, first_rollout
+from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "a2c": {"clip": None, "epochs": 1, "trace": 1.0, "rollout_steps": 16, "target_kl": None},
+    "reinforce": {"clip": None, "epochs": 1, "trace": 1.0},
+}
+"""Where their defaults are others than those of the fields below."""
 
-class PPOSettings(Settings):
-    """Policy gradients on the learned reward: PPO (Schulman et al. 2017); with clip=null, epochs=1 and trace=1 it is
-    REINFORCE with a learned baseline."""
 
-    kind: Literal["ppo"] = "ppo"
+class ControlLearnerSettings(Settings):
+    """Our own policy gradients on the learned reward: PPO by default, A2C or REINFORCE with a learned baseline."""
+
+    kind: Literal["control"] = "control"
+    algorithm: Literal["ppo", "a2c", "reinforce"] = "ppo"
+    """What fills in the defaults: ppo (Schulman et al. 2017); a2c (Mnih et al. 2016), short rollouts and one step on
+    each; reinforce (Williams 1992), whole returns. Anything that is set beside it stands."""
     environments: int = Field(16, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
@@ -77,9 +76,16 @@ class PPOSettings(Settings):
     """Of the actions' noise at the start, in units of half the action bounds."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in(cls, given: Any) -> Any:
+        return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")
-    def _whole_steps(self) -> PPOSettings:
+    def _whole_steps(self) -> ControlLearnerSettings:
         if self.steps_per_round % self.environments or self.steps_per_round < 2 * self.environments:
             raise ValueError(
                 f"steps_per_round must be a multiple of environments, and at least twice it, "
@@ -87,15 +93,24 @@ class PPOSettings(Settings):
             )
         return self
 
-    def shrunk(self) -> PPOSettings:
+    def shrunk(self) -> ControlLearnerSettings:
         steps = min(self.steps_per_round, self.environments * self.rollout_steps)
         return self.model_copy(update={"steps_per_round": steps, "evaluation_episodes": 1})
+
+    def with_evaluation_of(self, other: ControlLearnerSettings) -> ControlLearnerSettings:
+        return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
 
     def work(self) -> float:
         return float(self.steps_per_round)
 
-    def build(self, task: Task, rng: np.random.Generator) -> PPO:
-        return PPO(self, control(task, self.kind), rng)
+    def build(self, task: Task, rng: np.random.Generator) -> ControlLearner:
+        return ControlLearner(self, control(task, f"learner kind {self.kind!r} acts in control tasks"), rng)
+
+    def objective(self) -> Objective:
+        """What a gradient step minimises."""
+        return Objective(
+            clip=self.clip, value=self.value_weight, entropy=self.entropy, max_grad_norm=self.max_grad_norm
+        )
 
     def formula(self) -> str:
         """The objective, as text."""
@@ -113,23 +128,7 @@ class PPOSettings(Settings):
         return "\n".join(lines)
 
 
-@dataclass(frozen=True, eq=False)
-class _Data:
-    """A rollout as the update sees it; B = n x T steps."""
-
-    inputs: Tensor
-    """(B, O) normalised observations."""
-    choices: Tensor
-    """(B, A)."""
-    logp: Tensor
-    """(B,) of the choices, under the policy that made them."""
-    advantages: Tensor
-    """(B,) whitened."""
-    returns: Tensor
-    """(B,) the critic's targets."""
-
-
-class PPO:
+class ControlLearner:
     """A `prefrl.protocols.Learner` of segments.
 
     Rewards are scored once a rollout, in one batch, and multiplied by sqrt(1 - discount^2): returns, and with them the
@@ -137,11 +136,11 @@ class PPO:
     update and the next rollout only, so the probability ratio is exactly 1 before the first gradient step.
     """
 
-    def __init__(self, settings: PPOSettings, task: ControlTask, rng: np.random.Generator) -> None:
+    def __init__(self, settings: ControlLearnerSettings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
-        self.policy = Policy(task, settings.hidden, settings.initial_std, rng)
-        self._parameters = [*self.policy.actor_parameters(), *self.policy.critic]
-        self._optimizer = torch.optim.Adam(self._parameters, settings.learning_rate, eps=1e-5, fused=True)
+        self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
+        self.policy.to(device_of(settings.device))
+        self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._steps, self._rounds = Steps(), 0
         self._recent: Rollout | None = None
 
@@ -154,27 +153,33 @@ class PPO:
         rollout = self._recent
         if rollout is None:
             most = self._settings.environments
-            rollout = first_rollout(self._task, lambda o: self.policy.act(o, rng), count, most, rng)
+            rollout = first_rollout(self._task, self._act(rng), count, most, rng)
             self._steps = self._steps.add(query=rollout.ends.size)
         return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
-        """`steps_per_round` environment steps of learning, from fresh episodes."""
+        """`steps_per_round` environment steps of learning, from fresh episodes; metrics are means over rollouts.
+
+        Those of `gradient.step`, each a mean over a rollout's gradient steps; explained, the share of the returns'
+        variance that the critic explains; and reward, the learned one of a step.
+        """
         scorer, count = step_rewards(reward), self._settings.environments
         envs, rollouts, metrics = self._task.environments(count), [], []
         observations = envs.reset(rng)
         for number, steps in enumerate(self._rollout_lengths()):
-            rollout, observations = collect(envs, observations, steps, lambda o: self.policy.act(o, rng))
+            rollout, observations = collect(envs, observations, steps, self._act(rng))
             self._steps = self._steps.add(learn=rollout.ends.size)
+            # Only before the first rollout is the reward one that the critic has not seen.
             metrics.append(self._learn(rollout, scorer, rng, critic_first=number == 0))
             rollouts.append(rollout)
+        # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._recent, self._rounds = joined(rollouts), self._rounds + 1
         return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
         episodes = self._settings.evaluation_episodes
-        rollout = whole_episodes(self._task, lambda o: self.policy.act(o, None), episodes, rng)
+        rollout = whole_episodes(self._task, self._act(None), episodes, rng)
         self._steps = self._steps.add(evaluate=rollout.ends.size)
         return evaluation(self._task, rollout, reward)
 
@@ -197,93 +202,82 @@ class PPO:
 
     def _rollout_lengths(self) -> list[int]:
         each = self._settings.steps_per_round // self._settings.environments
+        # Equal parts: a short last rollout would whiten its advantages over a handful of steps.
         parts = max(1, round(each / self._settings.rollout_steps))
         return [len(part) for part in np.array_split(np.arange(each), parts)]
 
     def _learn(
         self, rollout: Rollout, reward: StepRewardModel, rng: np.random.Generator, critic_first: bool
     ) -> Metrics:
+        """Learn from one rollout."""
+        settings, objective = self._settings, self._settings.objective()
         rewards = learned_rewards(reward, rollout)
-        data, spread = self._data(rollout, rewards)
-        if critic_first and self._settings.critic_epochs:
-            for rows in self._minibatches(len(data.returns), self._settings.critic_epochs, rng):
-                self._descend(self._value_loss(data, rows))
-            data, spread = self._data(rollout, rewards)
-        losses = [self._update(data, rows) for rows in self._minibatches(len(data.returns), self._settings.epochs, rng)]
+        batch, explained = self._batch(rollout, rewards)
+        if critic_first and settings.critic_epochs:
+            alone = replace(objective, policy=False)
+            update(
+                self.policy, self._optimizer, batch, self._minibatches(len(batch), settings.critic_epochs, rng), alone
+            )
+            batch, explained = self._batch(rollout, rewards)  # advantages by the critic that knows the new reward
+        minibatches = self._minibatches(len(batch), settings.epochs, rng)
+        steps = update(self.policy, self._optimizer, batch, minibatches, objective)
+        # Not before the update: actions were drawn under the old statistics, and the ratio must start at 1.
         self.policy.observe(rollout.observations)
-        self._steer(float(np.mean([loss[4] for loss in losses[-len(losses) // self._settings.epochs :]])))
-        means = torch.tensor(losses).mean(0).tolist()
-        names = ("policy_loss", "value_loss", "entropy", "clipped", "kl_old")
-        return dict(zip(names, means, strict=True)) | {"explained": spread, "reward": float(rewards.mean())}
+        if settings.target_kl is not None:
+            last = steps[-len(steps) // settings.epochs :]  # the last epoch's
+            kl = float(np.mean([step["kl_old"] for step in last]))
+            steer(self._optimizer, kl, settings.target_kl, settings.learning_rate)
+        means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
+        # The first step's, where nothing has changed yet: anything but rounding is a bug.
+        return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
 
     @torch.no_grad()
-    def _data(self, rollout: Rollout, rewards: Floats) -> tuple[_Data, float]:
-        """What the update needs, and the share of the returns' variance that the critic explains."""
+    def _batch(self, rollout: Rollout, rewards: Floats) -> tuple[Batch[Decisions], float]:
+        """What the update needs, B = n x T sequences of one step, and how much of the returns the critic explains."""
         settings, policy = self._settings, self.policy
-        inputs = torch.from_numpy(policy.normalise(rollout.observations))
-        values = policy.values(inputs)
-        ends = torch.from_numpy(rollout.ends)
-        scaled = torch.from_numpy(rewards).float() * _scale(settings.discount)
+        observations = self._tensor(policy.normalise(rollout.observations))
+        values = policy.values_of(observations)  # (n, T)
+        ends = self._tensor(rollout.ends)
+        scaled = self._tensor(rewards).float() * _scale(settings.discount)
         advantages = gae(scaled, values, self._next_values(rollout, values), ends, settings.discount, settings.trace)
         returns = advantages + values
+        # The clamp: returns that do not vary leave nothing to explain.
         explained = 1.0 - float(advantages.var() / returns.var().clamp(min=1e-12))
-        flat, choices = inputs.flatten(0, 1), torch.from_numpy(rollout.choices).flatten(0, 1)
+        # Whitened only now: the critic's targets above are in the units of the reward.
         white = masked_whiten(advantages, torch.ones_like(advantages))
-        logp, _ = policy.log_prob(flat, choices)
-        return _Data(flat, choices, logp, white.flatten(), returns.flatten()), explained
+        # (n, T, .) -> (B, .), in the order that view(-1, 1) gives the other columns below.
+        legal = None if rollout.legal is None else self._tensor(rollout.legal).flatten(0, 1)
+        decisions = Decisions(observations.flatten(0, 1), self._tensor(rollout.choices).flatten(0, 1), legal)
+        # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
+        logp, _ = policy.log_prob(decisions)
+        return Batch(decisions, logp, white.view(-1, 1), returns.view(-1, 1)), explained
 
     def _next_values(self, rollout: Rollout, values: Tensor) -> Tensor:
         """(n, T): the value of what each step led to."""
         unseen = rollout.ends.copy()
-        unseen[:, -1] = True
-        final = torch.from_numpy(self.policy.normalise(rollout.final_observations[unseen]))
+        unseen[:, -1] = True  # what follows a row's last step is in the next rollout
+        final = self._tensor(self.policy.normalise(rollout.final_observations[unseen]))
+        # After an end the next column belongs to another episode, so the final observation is valued by itself. The
+        # column that fills up the end of each row is among those replaced.
         following = torch.cat([values[:, 1:], values[:, :1]], 1)
-        following[torch.from_numpy(unseen)] = self.policy.values(final)
-        return following * ~torch.from_numpy(rollout.terminated)
+        following[self._tensor(unseen)] = self.policy.values_of(final)
+        return following * ~self._tensor(rollout.terminated)  # a time limit still has a future
 
     def _minibatches(self, size: int, epochs: int, rng: np.random.Generator) -> list[Tensor]:
         parts = max(1, round(size / self._settings.minibatch))
-        orders = [torch.from_numpy(rng.permutation(size)) for _ in range(epochs)]
+        orders = [self._tensor(rng.permutation(size)) for _ in range(epochs)]
+        # tensor_split leaves no small remainder, whose gradient would be mostly noise.
         return [rows for order in orders for rows in order.tensor_split(parts)]
 
-    def _value_loss(self, data: _Data, rows: Tensor) -> Tensor:
-        returns = data.returns[rows]
-        return value_loss(self.policy.values(data.inputs[rows]), returns, returns).mean()
+    def _act(self, rng: np.random.Generator | None) -> Act:
+        """The policy's choices, drawn from `rng`, or its mode."""
+        return lambda observations, legal: self.policy.act(observations, rng, legal)
 
-    def _update(self, data: _Data, rows: Tensor) -> list[float]:
-        """One gradient step; policy loss, value loss, entropy, share of clipped ratios, KL(old || new)."""
-        settings = self._settings
-        logp, entropies = self.policy.log_prob(data.inputs[rows], data.choices[rows])
-        advantages, mask = data.advantages[rows], torch.ones_like(logp)
-        ratios = log_ratio(logp, data.logp[rows], mask)
-        gain = (
-            policy_gradient(logp, advantages)
-            if settings.clip is None
-            else clipped_surrogate(ratios, advantages, settings.clip)
-        )
-        policy_loss, values, entropy = masked_mean(gain, mask), self._value_loss(data, rows), entropies.mean()
-        self._descend(policy_loss + settings.value_weight * values - settings.entropy * entropy)
-        with torch.no_grad():
-            clipped = (ratios.expm1().abs() > (settings.clip or float("inf"))).float().mean()
-            kl = (ratios.expm1() - ratios).mean()
-            return torch.stack([policy_loss, values, entropy, clipped, kl]).tolist()
-
-    def _steer(self, kl: float) -> None:
-        """Move the learning rate by a factor of 1.5 at most once a rollout, as far as a hundredth or tenfold."""
-        target, group = self._settings.target_kl, self._optimizer.param_groups[0]
-        if target is None:
-            return
-        factor = 1 / 1.5 if kl > 2 * target else 1.5 if kl < target / 2 else 1.0
-        low, high = 0.01 * self._settings.learning_rate, 10 * self._settings.learning_rate
-        group["lr"] = min(max(group["lr"] * factor, low), high)
-
-    def _descend(self, loss: Tensor) -> None:
-        self._optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self._parameters, self._settings.max_grad_norm, error_if_nonfinite=True)
-        self._optimizer.step()
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        """An array on the policy's device."""
+        return torch.from_numpy(array).to(self.policy.device)
 
 
 def _scale(discount: float) -> float:
     """Returns of white noise of std 1 have a std of 1 / sqrt(1 - discount^2): this undoes it."""
-    return math.sqrt(1.0 - discount**2) or 1.0
+    return math.sqrt(1.0 - discount**2) or 1.0  # undiscounted returns have no such limit: left as they are

@@ -11,6 +11,7 @@ from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 Reduction: TypeAlias = Literal["token", "sequence", "constant"]
 MAX_LOG_RATIO = 20.0
@@ -20,41 +21,40 @@ MAX_LOG_RATIO = 20.0
 # --- Masked statistics ------------------------------------------------------------------------------------------
 
 
+def masked_sum(x: Tensor, mask: Tensor) -> Tensor:
+    """The sum over real steps. Padding may hold anything, NaN included."""
+    return torch.where(mask.bool(), x, 0.0).sum()  # not x * mask: NaN times 0 is NaN
+
+
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """The mean over real steps; 0 where there are none. Padding may hold anything, NaN included."""
-    return torch.where(mask.bool(), x, 0.0).sum() / mask.sum().clamp(min=1)
+    """The mean over real steps; 0 where there are none."""
+    return masked_sum(x, mask) / mask.sum().clamp(min=1)
 
 
-def masked_whiten(x: Tensor, mask: Tensor, shift_mean: bool = True, eps: float = 1e-8) -> Tensor:
-    """Scale to unit (biased) variance over real steps, and shift to mean 0 unless told not to; padding becomes 0.
-
-    Rewards are whitened with `shift_mean=False`: shifting would change the sign of sparse ones.
-    """
+def masked_whiten(x: Tensor, mask: Tensor, eps: float = 1e-8) -> Tensor:
+    """Shift and scale to mean 0 and unit (biased) variance over real steps; padding becomes 0."""
     mean = masked_mean(x, mask)
     variance = masked_mean((x - mean) ** 2, mask)
-    white = (x - mean) * torch.rsqrt(variance + eps)
-    return torch.where(mask.bool(), white if shift_mean else white + mean * torch.rsqrt(variance + eps), 0.0)
+    # eps under the root: where all steps are alike they become 0, not NaN.
+    return torch.where(mask.bool(), (x - mean) * torch.rsqrt(variance + eps), 0.0)
 
 
-def reduce(x: Tensor, mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
-    """One number from per-step losses (B, L).
+def reduce(x: Tensor, mask: Tensor, how: Reduction, rows: int, steps: int) -> Tensor:
+    """One number from per-step losses (B, L), of a minibatch of `rows` sequences that have `steps` real steps.
 
     - token: the mean over all real steps (DAPO, PPO). Long rows weigh more.
     - sequence: the mean over rows of each row's mean (GRPO). A step of a long row weighs less.
-    - constant: the sum divided by B x constant (REINFORCE, RLOO, Dr. GRPO). No length bias: with constant = 1 the
-      gradient of the expected return itself.
+    - constant: the sum divided by the number of rows (REINFORCE, RLOO). No length bias: the gradient of the expected
+      return itself.
+
+    What the parts of a minibatch come to adds up to what the whole does.
     """
-    return (torch.where(mask.bool(), x, 0.0) * step_weights(mask, how, constant)).sum()
-
-
-def step_weights(mask: Tensor, how: Reduction = "token", constant: float = 1.0) -> Tensor:
-    """(B, L): what each step counts in `reduce`; 0 on padding. With these a batch can be summed up a part at a time."""
-    real = mask.to(torch.get_default_dtype())
     if how == "token":
-        return real / real.sum().clamp(min=1)
+        return masked_sum(x, mask) / steps
     if how == "sequence":
-        return real / real.sum(1, keepdim=True).clamp(min=1) / len(real)
-    return real / (len(real) * constant)
+        # The clamp: a row without a real step has no mean, and adds 0.
+        return (torch.where(mask.bool(), x, 0.0).sum(1) / mask.sum(1).clamp(min=1)).sum() / rows
+    return masked_sum(x, mask) / rows
 
 
 # --- Rewards, returns, advantages -------------------------------------------------------------------------------
@@ -65,21 +65,9 @@ def step_rewards(scores: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tenso
 
     Ziegler et al. 2019, equation 2, with the KL written per token (estimator k1).
     """
-    last = (mask.sum(1).long() - 1).clamp(min=0)
+    last = (mask.sum(1).long() - 1).clamp(min=0)  # (B,); an empty row points at 0, and gets no score below
     rewards = torch.where(mask.bool(), -beta * kl, 0.0)
     return rewards.scatter_add(1, last[:, None], (scores * mask.any(1))[:, None].to(rewards.dtype))
-
-
-def returns_to_go(rewards: Tensor, mask: Tensor, discount: float = 1.0) -> Tensor:
-    """(B, L): the discounted sum of the rewards from each step on; padding is 0."""
-    rewards = torch.where(mask.bool(), rewards, 0.0)
-    if discount == 1.0:
-        return rewards.flip(1).cumsum(1).flip(1) * mask
-    running, out = torch.zeros_like(rewards[:, 0]), torch.empty_like(rewards)
-    for t in range(rewards.shape[1] - 1, -1, -1):
-        running = rewards[:, t] + discount * running
-        out[:, t] = running
-    return out * mask
 
 
 def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, discount: float, trace: float) -> Tensor:
@@ -89,8 +77,9 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
     after a truncation. `ends` is 1 where an episode stops, for either reason. Padding must be 0 in every argument.
     """
     delta = rewards + discount * next_values - values
+    # Any end cuts the trace: what comes after a time limit is another episode, though its value still bootstraps.
     keep = discount * trace * (1.0 - ends.to(delta.dtype))
-    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)
+    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)  # (B,), (B, L)
     for t in range(delta.shape[1] - 1, -1, -1):
         running = delta[:, t] + keep[:, t] * running
         out[:, t] = running
@@ -102,6 +91,7 @@ def leave_one_out(scores: Tensor) -> Tensor:
     count = scores.shape[1]
     if count < 2:
         raise ValueError(f"leave-one-out needs at least 2 responses a prompt, got {count}")
+    # x_i - (sum - x_i) / (K - 1) = (x_i - mean) K / (K - 1): no sum over the others for each i.
     return (scores - scores.mean(1, keepdim=True)) * (count / (count - 1))
 
 
@@ -113,6 +103,7 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
     if scores.shape[1] < 2:
         raise ValueError(f"group normalisation needs at least 2 responses a prompt, got {scores.shape[1]}")
     centred = scores - scores.mean(1, keepdim=True)
+    # The mean of equal numbers can differ from them in its last bit, which a std of 0 plus eps would blow up.
     equal = (scores == scores[:, :1]).all(1, keepdim=True)
     return torch.where(equal, 0.0, centred / (scores.std(1, keepdim=True) + eps))
 
@@ -122,6 +113,7 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
 
 def log_ratio(logp: Tensor, old_logp: Tensor, mask: Tensor) -> Tensor:
     """log pi(a) - log pi_old(a), clamped; 0 on padding, whatever it holds."""
+    # Padding goes first: a clamp lets NaN through.
     return torch.where(mask.bool(), logp - old_logp, 0.0).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
 
 
@@ -148,10 +140,15 @@ def value_loss(values: Tensor, old_values: Tensor, returns: Tensor, clip: float 
     return 0.5 * torch.maximum(free, (near - returns) ** 2)
 
 
-def categorical_entropy(logits: Tensor) -> Tensor:
-    """(..., V) -> (...): entropy in nats."""
-    logp = logits.log_softmax(-1)
-    return -(logp.exp() * logp).sum(-1)
+def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
+    """(M,) losses of pairs from beta x the difference of their log-ratios to the reference (M,).
+
+    Rafailov et al. 2023, equation 7; `preference` (M,) in [0, 1] is for the first of a pair, and `smoothing` the share
+    of them that are taken to be wrong (cDPO, Mitchell 2023).
+    """
+    right = preference * (1 - smoothing) + (1 - preference) * smoothing
+    # log(1 - s(h)) as logsigmoid(-h): the other way it is log 0 for a large margin.
+    return -(right * logsigmoid(margins) + (1 - right) * logsigmoid(-margins))
 
 
 # --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------
@@ -186,5 +183,6 @@ class AdaptiveKL:
 
     def update(self, kl: float, sequences: int) -> AdaptiveKL:
         """`kl`: the mean KL per sequence (not per token) over the last `sequences`."""
+        # The paper's clip: one batch far off the target moves beta no further than one 20 % off.
         error = min(max(kl / self.target - 1.0, -0.2), 0.2)
         return replace(self, beta=self.beta * (1.0 + error * sequences / self.horizon))

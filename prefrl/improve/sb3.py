@@ -19,25 +19,21 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings
-from prefrl.improve.rollout import (
-    Rollout,
-    control,
-    cut,
-    evaluation,
-    first_rollout,
-    step_rewards,
-    whole_episodes,
-)
+from prefrl.evaluate.policies import evaluation
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
-from prefrl.protocols import ControlTask, RewardModel, Store, Task
-from prefrl.seeding import draw_seed
-from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
+from prefrl.policies.rollout import Rollout, step_rewards, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
+from prefrl.sample.segments import cut, first_rollout
+from prefrl.seeding import Device, device_of, draw_seed
+from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS = {"PPO": PPO, "SAC": SAC}
 PPO_STEPS = 2048
 """stable-baselines3's default `n_steps`."""
 BATCH = 64
 """The default `batch_size` of its PPO."""
+DISCOUNT = 0.99
+"""The default `gamma` of its algorithms."""
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -57,6 +53,8 @@ class SB3Settings(Settings):
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, without exploration, in environments of their own."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
     def shrunk(self) -> SB3Settings:
         """One rollout of a batch in each environment for PPO; for SAC about as many steps, learning from the first."""
@@ -66,13 +64,22 @@ class SB3Settings(Settings):
         if self.algorithm == "PPO":
             options["n_steps"] = each = min(self.at_once, options.get("batch_size", BATCH))
         else:
-            options["learning_starts"] = 0
+            options["learning_starts"] = 0  # else a trial run would end before the first gradient step
             each = min(self.steps_per_round // self.environments, self.at_once * max(1, BATCH // self.at_once))
         steps = each * self.environments
         return self.model_copy(update={"options": options, "steps_per_round": steps, "evaluation_episodes": 1})
 
+    def with_evaluation_of(self, other: SB3Settings) -> SB3Settings:
+        return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
+
     def work(self) -> float:
         return float(self.steps_per_round)
+
+    @property
+    def discount(self) -> float:
+        """stable-baselines3's `gamma`."""
+        options: dict[str, Any] = self.options
+        return float(options.get("gamma", DISCOUNT))
 
     @property
     def at_once(self) -> int:
@@ -84,7 +91,7 @@ class SB3Settings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
-        found = control(task, self.kind)
+        found = control(task, f"learner kind {self.kind!r} acts in control tasks")
         if self.algorithm == "SAC" and found.action_bounds is None:
             raise ConfigError("learner.algorithm=SAC needs continuous actions; use PPO")
         return SB3(self, found, rng)
@@ -129,14 +136,16 @@ class SB3:
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
         self._learned.learned, before = step_rewards(reward), self._env.steps
+        # Before learning: the buffer holds what the reward model said before its last fit.
         if isinstance(self.model, SAC):
             relabel(self.model.replay_buffer, step_rewards(reward))
         self._env.start(rng)
         self.model._last_obs = None  # makes learn() reset the environments
         with seeded(rng):
-            self.model.action_space.seed(draw_seed(rng))
+            self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
             self.model.learn(self._settings.steps_per_round, reset_num_timesteps=False, log_interval=None)
         self._steps = self._steps.add(learn=self._env.steps - before)
+        # Taken before the second start, which forgets it and so frees the memory.
         self._recent, self._rounds = self._env.rollout(), self._rounds + 1
         self._env.start(rng)
         values = self.model.logger.name_to_value
@@ -175,7 +184,7 @@ class SB3:
         self._steps, self._rounds = Steps(*state["steps"]), state["rounds"]
 
     def _act(self, deterministic: bool) -> Any:
-        def act(observations: Floats) -> tuple[Floats, Floats]:
+        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
             chosen, _ = self.model.predict(observations, deterministic=deterministic)
             actions = executed(self._env.action_space, chosen)
             return actions, actions
@@ -188,7 +197,8 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
     """stable-baselines3 draws from the global generators: seed them from `rng`, and put them back at the end."""
     python, numpy_ = random.getstate(), np.random.get_state()
     try:
-        with torch.random.fork_rng(devices=[]):
+        # CPU only: by default the state of every GPU would be saved as well.
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             seed = draw_seed(rng)
             random.seed(seed)
             np.random.seed(seed)
@@ -204,10 +214,11 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
     if settings.algorithm == "PPO":
         options.setdefault("n_steps", settings.at_once)
     try:
+        device = device_of(settings.device)
         return ALGORITHMS[settings.algorithm](
-            "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device="cpu", verbose=0, **options
+            "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device=device, verbose=0, **options
         )
-    except TypeError as error:
+    except TypeError as error:  # an option that its constructor does not have
         raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error
 
 
@@ -230,6 +241,7 @@ def _attribute(model: Any, dotted: str) -> Any:
 
 def _replay_state(buffer: ReplayBuffer) -> State:
     size = buffer.size()
+    # What is filled, not what is allocated: a buffer may have room for a million steps.
     return {name: getattr(buffer, name)[:size].copy() for name in REPLAY} | {"pos": buffer.pos, "full": buffer.full}
 
 

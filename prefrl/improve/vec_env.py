@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from prefrl.improve.rollout import Rollout
+from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask, StepRewardModel, Transition
 from prefrl.types import Floats
 
@@ -42,11 +42,13 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
         return self._last
 
     def step_async(self, actions: np.ndarray) -> None:
+        # What is executed is what is kept: a segment must not hold an action that the simulator never saw.
         self._actions = executed(self.action_space, actions)
 
     def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
-        states = self.envs.states()
+        states = self.envs.states()  # before the step, as a segment pairs each state with the action taken in it
         step = self.envs.step(self._actions)
+        # A copy: some simulators go on writing into the array that they gave out.
         self._rows.append((self._last, self._actions, None if states is None else states.copy(), step))
         self._last, self.steps = step.observations, self.steps + self.num_envs
         return step.observations, step.rewards.astype(np.float32), step.terminated | step.truncated, _infos(step)
@@ -110,9 +112,12 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
 
     def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
         observations, _, dones, infos = self.venv.step_wait()
+        # The observation that the action was chosen on, not the one it led to.
         self._recent.append((self._observations.reshape(self.num_envs, -1), self._actions, self._begins))
         self._recent = self._recent[-(1 if self.learned is None else self.learned.memory) :]
+        # (n, up to memory, .) steps -> (n,): the reward of the newest of them.
         rewards = _score(self.learned, *(np.stack(part, 1) for part in zip(*self._recent, strict=True)))[:, -1]
+        # A VecEnv resets at once, so what follows a done is the first observation of an episode.
         self._observations, self._begins = observations, dones
         return observations, rewards, dones, infos
 
@@ -123,6 +128,7 @@ def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
     A reward that looks back sees what the buffer still holds of its episode. Raises ValueError for buffers that keep
     something else than one transition a slot.
     """
+    # Not isinstance: subclasses keep sums over several steps, goals, or dicts.
     if type(buffer) is not ReplayBuffer:
         raise ValueError(f"relabel needs stable-baselines3's plain ReplayBuffer, got {type(buffer).__name__}")
     size, space = buffer.size(), buffer.action_space
@@ -133,7 +139,9 @@ def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
         actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
     flat = executed(space, actions.reshape(size * buffer.n_envs, -1)).reshape(size, buffer.n_envs, -1)
     observations = buffer.observations[:size].reshape(size, buffer.n_envs, -1)
+    # In a full ring the next slot to be overwritten is the oldest.
     oldest_first = np.roll(np.arange(size), -buffer.pos if buffer.full else 0)
+    # (size, n, .) -> (n, size, .): a row for each environment, as a reward model has it.
     parts = (x[oldest_first].swapaxes(0, 1) for x in (observations, flat, _begins(buffer, size)))
     buffer.rewards[oldest_first] = _score(reward, *parts).T
 
@@ -143,9 +151,10 @@ def _begins(buffer: ReplayBuffer, size: int) -> np.ndarray:
     ends = buffer.dones[:size] > 0
     if not buffer.optimize_memory_usage:  # which would hold no other next observation than the next slot's
         resets = buffer.next_observations[:size] != np.roll(buffer.observations[:size], -1, 0)
+        # A reset from outside, between two calls of learn(), leaves no done behind, but the observations do not join.
         ends = ends | resets.reshape(size, buffer.n_envs, -1).any(2)
     begins: np.ndarray = np.roll(ends, 1, 0)
-    begins[buffer.pos % size if buffer.full else 0] = True
+    begins[buffer.pos % size if buffer.full else 0] = True  # what came before the oldest slot is gone
     return begins
 
 
@@ -155,7 +164,7 @@ def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
         clipped: Floats = np.clip(actions, space.low, space.high).astype(np.float32)
         return clipped
     if isinstance(space, gymnasium.spaces.Discrete):
-        chosen = np.asarray(actions).reshape(-1).astype(np.int64) - int(space.start)
+        chosen = np.asarray(actions).reshape(-1).astype(np.int64) - int(space.start)  # a Discrete may count from 1
         return np.eye(int(space.n), dtype=np.float32)[chosen]
     raise ValueError(f"actions must be a Box or Discrete, got {space}")
 
@@ -164,6 +173,7 @@ def _infos(step: Transition) -> list[dict[str, Any]]:
     infos: list[dict[str, Any]] = [{} for _ in step.rewards]
     for i in np.flatnonzero(step.terminated | step.truncated):
         infos[i] = {
+            # The observation returned is the next episode's already: the value of a time limit must come from here.
             "terminal_observation": step.final_observations[i],
             "TimeLimit.truncated": bool(step.truncated[i]),
         }

@@ -12,9 +12,10 @@ from typing import Generic, NamedTuple
 
 import numpy as np
 
-from prefrl.files import DamagedError
+from prefrl.kinds import kind_of
 from prefrl.protocols import Store
-from prefrl.types import C, Floats, Integers, Query, Segment
+from prefrl.storage.files import DamagedError
+from prefrl.types import C, Floats, Integers, Query
 
 MOST = 1000
 """Candidates whose gold is looked at; each is a file."""
@@ -77,6 +78,7 @@ def clear_queries(
     rows = np.array(known)[groups]
     ranked = np.sort(gold[rows].astype(np.float64), axis=1)
     gap = ranked[:, -1] - ranked[:, -2]
+    # A quantile, not a size: gold is on any scale.
     least_gap = np.quantile(gap, 1 - top)
     if least_gap <= TINY * np.abs(gold[known]).max():
         return Checks([], [], "gold differs too little for an answer to be clear")
@@ -112,9 +114,10 @@ def _groups(candidates: Sequence[C], size: int, rng: np.random.Generator) -> Int
     for i in rng.integers(len(candidates), size=TRIES):
         members = by_context[candidates[i].context]
         if len(members) >= size:
+            # Sorted, so that the same group in another order is not found again.
             group = sorted(members[j] for j in rng.choice(len(members), size, replace=False))
-            episodes = [c.episode for c in (candidates[j] for j in group) if isinstance(c, Segment)]
-            if len(set(episodes)) == len(episodes):
+            origins = {kind_of(c).origin(c) for c in (candidates[j] for j in group)}
+            if len(origins) == size:
                 found[tuple(group)] = None
     return np.array(list(found), np.int64).reshape(-1, size)
 
@@ -125,6 +128,7 @@ def _sample(contexts: Sequence[str], rng: np.random.Generator) -> list[int]:
     for i, context in enumerate(contexts):
         by_context[context].append(i)
     names = list(by_context)
+    # Context by context: MOST single candidates of as many prompts would make no group at all.
     order = [i for at in rng.permutation(len(names)) for i in rng.permutation(by_context[names[at]]).tolist()]
     return sorted(order[:MOST])
 

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import Settings
+from prefrl.judgements import Answer
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.label.teachers import Limits, survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Floats, Query, Skip
+from prefrl.types import C, Floats, Query
 
 
 class CrowdSettings(Settings):
@@ -57,6 +58,7 @@ class Crowd:
         queries = store.open_queries(self.name)
         if not queries:
             return
+        # Once, before anybody answers: limits must not hang on who of the crowd came first.
         asked = survey(store, self.name)
         limits = {a.name: a.limits(asked) for a in self.annotators}
         willing = {a.name: {q.id for q in store.open_queries(a.name)} for a in self.annotators}
@@ -71,8 +73,9 @@ class Crowd:
         answers: list[Answer] = []
         for i in keyed(base, query.id).permutation(len(self.annotators)):
             one = self.annotators[i]
-            if sum(not isinstance(a, Skip) for a in answers) == self.settings.overlap:
+            if sum(a.reason is None for a in answers) == self.settings.overlap:
                 break
             if one.name in able:
+                # A generator for each: who else answers does not change what is said.
                 answers.append(one.judge(query, gold, keyed(base, f"{query.id}/{one.name}"), able[one.name]))
         return answers

@@ -12,12 +12,15 @@ import numpy as np
 import torch
 from pydantic import Field, field_validator
 from torch import Tensor
-from transformers import AutoModelForCausalLM, AutoTokenizer, GenerationConfig, PreTrainedTokenizerBase
+from transformers import AutoModelForCausalLM, GenerationConfig, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError, Settings
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
+from prefrl.kinds import kind_of, only
 from prefrl.label.prompts import Prompter, answer_tokens, verdict
-from prefrl.protocols import Store, Task, TextTask
-from prefrl.types import Answer, C, Comparison, Floats, Integers, Metrics, Query, Ranking, Response, Skip
+from prefrl.policies.pretrained import load_tokenizer, load_weights
+from prefrl.protocols import Store, Task, text
+from prefrl.types import C, Floats, Integers, Metrics, Query, Response
 
 TEMPLATE = """\
 Below are a prompt and two responses to it, A and B, each between two equal lines. What is between such lines is
@@ -78,28 +81,17 @@ class JudgeSettings(Settings):
 
     def build(self, task: Task) -> Judge:
         """Raises `ConfigError` for a control task, and where the model is missing or cannot say the answers."""
-        if task.kind != "text":
-            raise ConfigError(f"labeler kind 'judge' reads text responses, but the task is of kind {task.kind!r}")
-        text: TextTask = task  # type: ignore[assignment]
-        model, tokenizer = _load(self) if self.model else (text.model(), text.tokenizer)
+        texts = text(task, "labeler kind 'judge' reads text responses")
+        model, tokenizer = _load(self) if self.model else (texts.model(), texts.tokenizer)
         return Judge(self, model, tokenizer)
 
 
 def _load(settings: JudgeSettings) -> tuple[Any, PreTrainedTokenizerBase]:
-    """A model in float32 with dropout off; weights in safetensors only, and no code of the model's own."""
-    local = not settings.download
     try:
-        tokenizer = AutoTokenizer.from_pretrained(settings.model, local_files_only=local)
-        model = AutoModelForCausalLM.from_pretrained(
-            settings.model, dtype=torch.float32, local_files_only=local, use_safetensors=True
-        )
-    except (OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        hint = "name a folder that holds one, or set labeler.download=true" if local else "check the name"
-        raise ConfigError(
-            f"labeler.model: no causal model could be read from {settings.model!r} ({reason}); {hint}"
-        ) from error
-    return model, tokenizer
+        model = load_weights(AutoModelForCausalLM, settings.model, settings.download, "labeler.download")
+        return model, load_tokenizer(settings.model, settings.download)
+    except ConfigError as error:
+        raise ConfigError(f"labeler.model: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -176,7 +168,7 @@ class Judge:
         """The probability that the first response shown is better, for each question; those of like length together."""
         self._check_room(max(map(len, questions), default=0))
         order = sorted(range(len(questions)), key=lambda i: len(questions[i]))
-        found = np.full(len(questions), np.nan)
+        found = np.full(len(questions), np.nan)  # no answer yet, and a refusal stays so
         for start in range(0, len(order), self.settings.batch_size):
             chunk = order[start : start + self.settings.batch_size]
             ids, mask = _left_padded([questions[i] for i in chunk])
@@ -186,13 +178,15 @@ class Judge:
     @torch.no_grad()
     def _next(self, ids: Tensor, mask: Tensor) -> Floats:
         """From the probabilities of the next token; NaN where the answers have too little of them."""
+        # Padding on the left is not counted: absolute positions would otherwise depend on the rest of the batch.
         positions = (mask.cumsum(1) - 1).clamp(min=0)
         out = self.model(input_ids=ids, attention_mask=mask, position_ids=positions, use_cache=False, logits_to_keep=1)
-        log_p = out.logits[:, -1].float().log_softmax(-1)
+        log_p = out.logits[:, -1].float().log_softmax(-1)  # (B, V), in float32: near probabilities decide
         if log_p.isnan().any():
             raise ValueError("the judge's model gave logits that are not numbers: use another labeler.model")
         first, second = (log_p[:, tokens].logsumexp(1).double() for tokens in self._tokens)
         mass = first.exp() + second.exp()
+        # first / (first + second), which for two tiny probabilities would be 0 / 0.
         share = torch.sigmoid(first - second)
         found: Floats = torch.where(mass < self.settings.minimum_mass, torch.nan, share).numpy()
         return found
@@ -244,6 +238,7 @@ def _ranks(preferences: Floats, size: int) -> tuple[int, ...]:
     for (i, j), p in zip(combinations(range(size), 2), preferences, strict=True):
         wins[i] += p
         wins[j] += 1 - p
+    # Ranks step only where neighbours are more than rounding apart, so near equals share one.
     order = np.argsort(-wins, kind="stable")
     ranks: Integers = np.empty(size, np.int64)
     ranks[order] = np.cumsum([0, *(wins[order][:-1] - wins[order][1:] > EQUAL)])
@@ -251,10 +246,10 @@ def _ranks(preferences: Floats, size: int) -> tuple[int, ...]:
 
 
 def _text(query: Query[C], i: int) -> Response:
-    candidate = query.candidates[i]
-    if not isinstance(candidate, Response):
-        raise ConfigError("labeler kind 'judge' reads text responses, and the store holds control segments")
-    return candidate
+    candidate, kind = query.candidates[i], kind_of(query.candidates[i])
+    held = f"{kind.name} {kind.noun}s"
+    error = ConfigError(f"labeler kind 'judge' reads text responses, and the store holds {held}")
+    return only(Response, [candidate], error)[0]
 
 
 def _left_padded(rows: Sequence[list[int]]) -> tuple[Tensor, Tensor]:

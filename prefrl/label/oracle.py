@@ -10,11 +10,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
+from prefrl.kinds import named
 from prefrl.label import teachers
 from prefrl.label.teachers import Limits, Survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Choice, Comparison, Floats, Query, Ranking, Rating, Skip
+from prefrl.types import C, Floats, Query
 
 ONE_OF = (
     ["rationality", "error_rate"],
@@ -81,13 +83,16 @@ class OracleSettings(Settings):
         return self.judgement == "rating" or any(getattr(self, name) for name in RELATIVE)
 
     def build(self, task: Task) -> Oracle:
-        if task.kind == "text" and self.discount != 1:
+        kind = named(task.kind)
+        if not kind.stepwise and self.discount != 1:
             raise ConfigError(
-                f"labeler.discount: the gold of a text has one step, so expected 1, got {self.discount}; "
+                f"labeler.discount: the gold of a {kind.noun} has one step, so expected 1, got {self.discount}; "
                 "a myopic teacher needs a control task"
             )
-        if task.kind != "text" and self.length_bias:
-            raise ConfigError("labeler.length_bias: only texts differ in length; expected 0 for a control task")
+        if not kind.lengthy and self.length_bias:
+            raise ConfigError(
+                f"labeler.length_bias: only texts differ in length; expected 0 for a task of kind {task.kind!r}"
+            )
         return Oracle(self)
 
 
@@ -107,6 +112,7 @@ class Oracle:
         So a run that was killed gives the same ones when it goes on. Raises `ValueError` where gold is not finite.
         """
         base = draw_seed(rng)
+        # A generator for each query by its id: who answered what before, and in which order, changes nothing.
         queries = store.open_queries(self.name)
         limits = self.limits(teachers.survey(store, self.name) if queries and self.settings.relative else None)
         store.answer([self.judge(q, store.gold(q.candidates), keyed(base, q.id), limits) for q in queries])
@@ -117,6 +123,7 @@ class Oracle:
         found = Limits(-np.inf if s.skip_below is None else s.skip_below, s.tie_within, s.rationality)
         if not s.relative or asked is None or not asked.queries:
             return found
+        # In this order: thresholds are taken of what is seen, length included, and noise of what is not skipped.
         found = self._with_length(found, asked)
         seen = teachers.blocks([self.see(q, asked.gold[q.id], found) for q in asked.queries])
         return self._with_noise(self._with_thresholds(found, asked, seen), seen)
@@ -177,6 +184,7 @@ class Oracle:
         if self.settings.judgement == "rating":
             return self._rate(query, worth, mistaken, shown, limits)
         if rng.random() < self.settings.position_bias:
+            # A group stands where its first one was shown: what is equal stays equal.
             worth = -np.array([min(shown.index(j) for j in np.flatnonzero(groups[0] == g)) for g in groups[0]], float)
         return self._order(query, -worth if mistaken else worth, shown, rng)
 

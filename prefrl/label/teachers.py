@@ -16,8 +16,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit
 
+from prefrl.kinds import kind_of
 from prefrl.protocols import Store
-from prefrl.types import C, Floats, Integers, Query, Response
+from prefrl.types import C, Floats, Integers, Query
 
 LARGEST = 700.0
 """The largest logit that is worked with: its exponential is still finite."""
@@ -71,6 +72,7 @@ def discounted(gold: Sequence[Floats], discount: float) -> Floats:
 
     Raises `ValueError` where one is not finite.
     """
+    # Backwards: a myopic teacher remembers the end best.
     seen = np.array([(g * discount ** np.arange(len(g))[::-1]).sum() for g in gold], float)
     if not np.isfinite(seen).all():
         raise ValueError(f"a simulated teacher needs finite gold, got {seen}; use another labeler")
@@ -78,8 +80,8 @@ def discounted(gold: Sequence[Floats], discount: float) -> Floats:
 
 
 def lengths(query: Query[C]) -> Floats:
-    """(K,) characters of each response, 0 for segments."""
-    return np.array([len(c.text) if isinstance(c, Response) else 0 for c in query.candidates], float)
+    """(K,) characters of each candidate, 0 where there are none to see."""
+    return np.array([kind_of(c).words(c) for c in query.candidates], float)
 
 
 def blocks(values: Sequence[Floats]) -> list[Floats]:
@@ -99,7 +101,7 @@ def gaps(seen: Sequence[Floats | Integers]) -> Floats:
 
 def tie_groups(block: Floats, tie_within: float) -> Integers:
     """(Q, K) ranks, 0 is best; a candidate joins the group above while it is within reach of that group's best."""
-    order = np.argsort(-block, axis=1, kind="stable")
+    order = np.argsort(-block, axis=1, kind="stable")  # equal ones stay in the query's own order
     ranked = np.take_along_axis(block, order, 1)
     best, groups = ranked[:, 0], np.zeros(block.shape, np.int64)
     for k in range(1, block.shape[1]):
@@ -107,13 +109,13 @@ def tie_groups(block: Floats, tie_within: float) -> Integers:
         best = np.where(apart, ranked[:, k], best)
         groups[:, k] = groups[:, k - 1] + apart
     found = np.empty_like(groups)
-    np.put_along_axis(found, order, groups, 1)
+    np.put_along_axis(found, order, groups, 1)  # from the order of worth back to that of the query
     return found
 
 
 def group_means(block: Floats, groups: Integers) -> Floats:
     """(Q, K): what is seen, with the mean of its group in the place of each candidate."""
-    same = groups[:, :, None] == groups[:, None, :]
+    same = groups[:, :, None] == groups[:, None, :]  # (Q, K, K)
     means: Floats = (same * block[:, None, :]).sum(2) / same.sum(2)
     return means
 
@@ -121,7 +123,7 @@ def group_means(block: Floats, groups: Integers) -> Floats:
 def skip_threshold(seen: Sequence[Floats], rate: float) -> float:
     """What leaves the best candidate of at most a share `rate` of the queries below it."""
     best = np.sort(np.concatenate([block.max(1) for block in seen]))
-    return float(best[int(rate * len(best) + 1e-9)])
+    return float(best[int(rate * len(best) + 1e-9)])  # 0.29 * 100 is less than 29 in floating point
 
 
 def tie_threshold(seen: Sequence[Floats], rate: float) -> float:
@@ -146,6 +148,7 @@ def rationality_for(seen: Sequence[Floats], tie_within: float, rate: float) -> f
     pairs = gaps([group_means(block, tie_groups(block, tie_within)) for block in seen])
     if not len(pairs):
         raise ValueError("error_rate is a share of pairs, and no query asked has two candidates; give rationality")
+    # In logarithms: gold can be of any size, and so can the beta that suits it.
     decided = np.log(pairs[pairs > 0])
     if not len(decided):
         return None
@@ -153,6 +156,7 @@ def rationality_for(seen: Sequence[Floats], tie_within: float, rate: float) -> f
     def excess(log_beta: float) -> float:
         return float(expit(-np.exp(np.minimum(log_beta + decided, np.log(LARGEST)))).mean()) - rate
 
+    # Below, every pair is a coin flip, and above none is wrong: the root lies in between.
     low, high = -np.log(LARGEST) - decided.max() - 20.0, np.log(LARGEST) - decided.min()
     return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
 

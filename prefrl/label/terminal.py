@@ -14,10 +14,12 @@ from rich.panel import Panel
 from rich.text import Text
 
 from prefrl.components import Settings
-from prefrl.label.clips import write_clip
-from prefrl.protocols import ControlTask, Store, Task
+from prefrl.judgements import Answer, Comparison, Ranking, Skip
+from prefrl.kinds import kind_of
+from prefrl.page.clips.encode import write_clip
+from prefrl.protocols import DrawnTask, Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import Answer, C, Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import C, Query
 
 
 class Stopped(KeyboardInterrupt):
@@ -32,6 +34,9 @@ class TerminalSettings(Settings):
     """Who answers; kept with every answer."""
     clips: Path = Path("clips")
     """Where the clips of control queries are written."""
+
+    def asks_people(self) -> bool:
+        return True
 
     def build(self, task: Task) -> Terminal:
         return Terminal(self, task)
@@ -55,6 +60,7 @@ class Terminal:
         while queries := store.open_queries(self.name):
             self.console.rule(f"{len(done)} answered, {len(queries)} to go")
             query = queries[0]
+            # By the query's id: asked again after an undo, it looks the same.
             shown = keyed(base, query.id).permutation(len(query.candidates)).tolist()
             self._show(query, shown)
             typed = self._ask(len(shown))
@@ -69,17 +75,18 @@ class Terminal:
     def _show(self, query: Query[C], shown: list[int]) -> None:
         """The candidates, numbered as they are shown."""
         candidates = [query.candidates[i] for i in shown]
-        if isinstance(candidates[0], Segment):
-            task = cast(ControlTask, self.task)
-            clips = [task.frames(c) for c in candidates if isinstance(c, Segment)]
+        kind = kind_of(candidates[0])
+        if kind.shows == "clip":
+            task = cast(DrawnTask[C], self.task)
+            clips = [task.frames(c) for c in candidates]
             path = write_clip(self.settings.clips / query.id[:12], clips, task.fps)
             order = ", ".join(str(n + 1) for n in range(len(shown)))
             self.console.print(Text(f"watch {path} (from left to right: {order})"))
             return
-        texts = [c for c in candidates if isinstance(c, Response)]
+        texts = [kind.shown(kind.describe(c)) for c in candidates]
         width = max(24, self.console.width // len(texts) - 2)
-        panels = [Panel(Text(visible(t.text)), title=str(n + 1), width=width) for n, t in enumerate(texts)]
-        self.console.print(Group(Text(visible(texts[0].prompt), style="bold"), Columns(panels, padding=(0, 1))))
+        panels = [Panel(Text(visible(t.text or "")), title=str(n + 1), width=width) for n, t in enumerate(texts)]
+        self.console.print(Group(Text(visible(texts[0].prompt or ""), style="bold"), Columns(panels, padding=(0, 1))))
 
     def _ask(self, count: int) -> str:
         """A line that can be interpreted; the rules are shown again after one that cannot."""

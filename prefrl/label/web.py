@@ -13,18 +13,19 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from prefrl.components import ConfigError, Settings, missing
+from prefrl.kinds import named
 from prefrl.label.checks import pick_checks
-from prefrl.label.server.clips import ClipSettings
-from prefrl.protocols import Store, Task
+from prefrl.page import api, static_files
+from prefrl.page.clips.queue import ClipSettings
+from prefrl.page.questions import Policy, Terms
+from prefrl.protocols import DrawnTask, Store, Task
 from prefrl.types import C
 
 if TYPE_CHECKING:  # a run without people loads no web server
-    from prefrl.label.server.site import Site
+    from prefrl.page.site import Site
 
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
-LOOKED_AT = {"control": 250, "text": 1000}
-"""Open queries whose candidates check questions are made of: segments are large, and stay in memory."""
 
 
 class Strengths(Settings):
@@ -98,7 +99,7 @@ class WebSettings(Settings):
     @field_validator("name")
     @classmethod
     def _can_be_a_name(cls, name: str) -> str:
-        from prefrl.label.server.access import check_name
+        from prefrl.page.access import check_name
 
         return check_name(name)
 
@@ -121,6 +122,9 @@ class WebSettings(Settings):
         """Where the page is served may change, when a port is taken say."""
         place = ("host", "port", "allowed_hosts", "tls_cert", "tls_key")
         return self.model_copy(update={name: type(self).model_fields[name].default for name in place})
+
+    def asks_people(self) -> bool:
+        return True
 
     def build(self, task: Task) -> WebLabeler:
         return WebLabeler(self, task)
@@ -150,10 +154,13 @@ class WebLabeler:
         """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
         self.fixed = fixed
         try:
-            from prefrl.label.server.site import open_site
+            from prefrl.page.site import Address, open_site
         except ModuleNotFoundError as error:
             raise ConfigError(f"labeler kind 'web': {missing(error)}") from error
-        self._site = open_site(self, store)
+        settings = self.settings
+        place = Address(settings.host, settings.port, settings.allowed_hosts, settings.tls_cert, settings.tls_key)
+        clips = settings.clips if named(self.task.kind).shows == "clip" else None
+        self._site = open_site(store, terms_of(settings, self.task, fixed), place, settings.name, clips)
         return self._site.notes
 
     def close(self) -> None:
@@ -185,6 +192,7 @@ class WebLabeler:
         """How many more questions must be judged before a round goes on; what everybody skipped is let go."""
         asked, judged, stuck = site.judged()
         share = self.settings.enough if self.settings.when_empty == "wait" else 0.0
+        # 0.07 * 100 is a little more than 7 in floating point, and would be rounded up to 8.
         wanted = max(1, math.ceil(share * (asked - stuck) - 1e-9))
         return min(asked - stuck, wanted) - judged
 
@@ -197,10 +205,41 @@ class WebLabeler:
         asked = store.counts()["asked"]
         if not self.settings.check_share or asked == self._checked:
             return
+        # Noted, so that a wait without new questions files no second set of checks.
         self._checked, open_ids = asked, site.open_queries()
-        some = rng.permutation(len(open_ids))[: LOOKED_AT[self.task.kind]]
+        some = rng.permutation(len(open_ids))[: named(self.task.kind).looked_at]
         looked_at = [cast(Any, store).query(open_ids[i]) for i in sorted(some.tolist())]
         count = math.ceil(self.settings.check_share * len(open_ids))
         chosen = pick_checks(store, looked_at, count, rng)
         if chosen.queries:
             cast(Any, store).ask(chosen.queries, purpose="check", expected=chosen.expected)
+
+
+def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
+    """What a project asks and how, from its settings. `fixed`: no more will be asked than the store holds."""
+    kind = named(task.kind)
+    clips = kind.shows == "clip"
+    page = api.Page(
+        title=task.name,
+        question=settings.question or kind.question,
+        kind=kind.name,
+        strength=settings.strength,
+        markdown=settings.markdown,
+        minimum_watched=settings.minimum_watched if clips else 0.0,
+        break_minutes=settings.break_minutes,
+        ui_version=static_files.ui_version(static_files.static_files()),
+    )
+    lease = settings.lease_seconds or kind.lease_seconds
+    policy = Policy(settings.overlap, lease, settings.check_share, settings.repeat_share, settings.seed)
+    return Terms(
+        page=page,
+        policy=policy,
+        strengths=dict(settings.strengths),
+        guideline=settings.guideline,
+        consent=settings.consent,
+        fps=cast(DrawnTask[Any], task).fps if clips else 0.0,
+        fixed=fixed and not settings.stay_open,
+        check_warn=settings.check_warn,
+        check_pause=settings.check_pause,
+        rate=settings.requests_per_second,
+    )

@@ -24,7 +24,7 @@ Score: TypeAlias = Literal["disagreement", "entropy", "information"]
 def disagreement(scores: Floats) -> Floats:
     """The members' std of the preference probability, averaged over pairs (Christiano et al. 2017, section 2.2.4)."""
     pairs = combinations(range(scores.shape[2]), 2)
-    spread = [expit(scores[:, :, i] - scores[:, :, j]).std(0) for i, j in pairs]
+    spread = [expit(scores[:, :, i] - scores[:, :, j]).std(0) for i, j in pairs]  # each (Q,)
     mean: Floats = np.mean(spread, axis=0)
     return mean
 
@@ -63,6 +63,7 @@ def joint_information(scores: Floats, count: int) -> Integers:
     precision, unit = np.eye(len(scores)), np.eye(scores.shape[2])
     chosen: list[int] = []
     for _ in range(count):
+        # What each query adds to those chosen before, whose information is in the precision (E, E).
         gains = np.linalg.slogdet(unit + blocks @ np.linalg.inv(precision) @ blocks.transpose(0, 2, 1))[1]
         gains[chosen] = -np.inf
         chosen.append(int(gains.argmax()))
@@ -72,6 +73,7 @@ def joint_information(scores: Floats, count: int) -> Integers:
 
 def _weighted_deviations(scores: Floats) -> Floats:
     """(Q, K, E): B_q with B_q B_q' similar to C_q F_q. With s = sqrt(p), F = R R' where R = diag(s) (I - s s')."""
+    # (E, Q, K), over E - 1: an unbiased estimate of C from E members.
     deviations = (scores - scores.mean(0)).astype(np.float64) / np.sqrt(len(scores) - 1)
     root = np.sqrt(_choices(scores).mean(0))[:, :, None]
     scaled = root * deviations.transpose(1, 2, 0)

@@ -21,7 +21,7 @@ def k_center(points: Floats, count: int) -> Integers:
     for _ in range(count):
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.square(points - points[chosen[-1]]).sum(1))
-        nearest[chosen[-1]] = -1.0
+        nearest[chosen[-1]] = -1.0  # below every distance, so that equal points do not bring it up again
     return np.array(chosen, np.int64)
 
 

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from prefrl.types import C, Candidate, Floats, Integers, Query, Segment
+from prefrl.kinds import kind_of
+from prefrl.types import C, Candidate, Floats, Integers, Query
 
 
 def overlap(a: Candidate, b: Candidate) -> bool:
-    """Whether two segments share steps of one episode; responses never do."""
-    if not (isinstance(a, Segment) and isinstance(b, Segment)) or a.episode != b.episode:
-        return False
-    return a.start < b.start + len(b) and b.start < a.start + len(a)
+    """Whether two candidates of a pool share a part, as two segments of one episode may."""
+    return kind_of(a).overlap(a, b)
 
 
 def newest(pool: Sequence[C], share: float) -> list[C]:
@@ -37,6 +36,7 @@ def groups(pool: Sequence[C], size: int, rng: np.random.Generator) -> Integers:
     found: list[list[int]] = []
     for members in by_context.values():
         found += _first_fit(pool, rng.permutation(members).tolist(), size)
+    # Shuffled: callers take the first ones, which would all be of the first contexts.
     return np.array(found, np.int64).reshape(-1, size)[rng.permutation(len(found))]
 
 
@@ -58,7 +58,7 @@ def _first_fit(pool: Sequence[C], members: Sequence[int], size: int) -> list[lis
 def proposals(pool: Sequence[C], size: int, times: int, rng: np.random.Generator) -> Integers:
     """(Q, K) distinct queries in random order; each candidate stands in about `times` of them."""
     drawn = np.concatenate([groups(pool, size, rng) for _ in range(times)])
-    return rng.permutation(np.unique(np.sort(drawn, axis=1), axis=0))
+    return rng.permutation(np.unique(np.sort(drawn, axis=1), axis=0))  # a query is a set: sorted rows make twins equal
 
 
 def disjoint(queries: Integers, order: Integers, count: int) -> Integers:
@@ -82,7 +82,7 @@ def topped_up(pool: Sequence[C], queries: Integers, count: int, rng: np.random.G
     if len(queries) >= count or len(left) < queries.shape[1]:
         return queries
     more = groups([pool[i] for i in left], queries.shape[1], rng)
-    return np.concatenate([queries, left[more]])[:count]
+    return np.concatenate([queries, left[more]])[:count]  # `more` counts within what is left
 
 
 def asked(pool: Sequence[C], queries: Integers) -> list[Query[C]]:

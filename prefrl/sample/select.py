@@ -101,7 +101,7 @@ class Scored(Generic[C]):
         queries = proposals(pool, settings.candidates, settings.proposals, rng)
         if not len(queries):
             return []
-        scores = reward.raw_member_scores(pool)[:, queries]
+        scores = reward.raw_member_scores(pool)[:, queries]  # (E, N) -> (E, Q, K): each candidate is scored once
         values = SCORES[settings.kind](scores)
         kept = count if settings.diversify == "none" else count * settings.shortlist
         rows = disjoint(queries, np.argsort(-values, kind="stable"), kept)

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from browser.house import House, Open, clips, copy, fill, serving, texts
 from browser.visitor import Visit, Visitor, enter
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser, expect, sync_playwright
 
-from prefrl.label.server.clips import Clips, ClipSettings
+from prefrl.page.clips.queue import Clips, ClipSettings
 
 PLACES = ("/usr/bin/chromium", "/usr/bin/chromium-browser")
 FLAGS = (
@@ -34,6 +34,7 @@ def chromium() -> Iterator[Browser]:
     if place is None:
         pytest.skip("needs Chromium: apt-get install -y chromium")
     with sync_playwright() as playwright:
+        expect.set_options(timeout=20_000)  # on a machine that does other things too
         browser = playwright.chromium.launch(executable_path=place, args=list(FLAGS))
         yield browser
         browser.close()

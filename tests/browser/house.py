@@ -13,20 +13,21 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import sqlalchemy as sql
 
-from prefrl import tables
 from prefrl.envs.toys import PointSettings
-from prefrl.label.server.service import Service
-from prefrl.label.server.site import Site
+from prefrl.judgements import Answer, Comparison
 from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.page.service import Service
+from prefrl.page.site import Site
+from prefrl.storage import tables
 from prefrl.store import Store
-from prefrl.types import Answer, Comparison, Query, Response, Segment
+from prefrl.types import Query, Response, Segment
 
 STEPS = 15
 POINT = PointSettings(segment_steps=STEPS)
 CONFIG = f"""\
 task: {{kind: point, segment_steps: {STEPS}}}
 reward: {{kind: mlp}}
-learner: {{kind: ppo}}
+learner: {{kind: control}}
 labeler: {{kind: web, check_share: 0, repeat_share: 0}}
 """
 """Of a folder with clips: for the process that draws them, and for the command line."""

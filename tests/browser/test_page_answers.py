@@ -10,7 +10,7 @@ from browser.house import FIRST, House, Open, fill, texts
 from browser.visitor import Visit, Visitor
 from playwright.sync_api import expect
 
-from prefrl.types import Comparison, Skip
+from prefrl.judgements import Comparison, Skip
 
 pytestmark = pytest.mark.browser
 

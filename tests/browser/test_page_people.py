@@ -52,7 +52,7 @@ def test_an_admin_invites_somebody_who_labels_in_another_browser(text_house: Hou
     zoe.saved()
     assert len(text_house.answers("Zoë")) == 2
     row = me.test("annotator-Zoë")
-    expect(row.locator("td").first).to_have_text("2", timeout=10_000)
+    expect(row.locator("td").first).to_have_text("2")
     expect(me.page.locator(".tile-value").first).to_have_text("2 / 24")
 
 
@@ -69,7 +69,7 @@ def test_a_paused_person_is_told_and_goes_on_when_let_in_again(text_house: House
     me.go("/admin")
     ann.press("1")
     me.test("pause-ann").click()
-    expect(ann.test("banner")).to_contain_text("paused", timeout=10_000)
+    expect(ann.test("banner")).to_contain_text("paused")
     ann.page.reload()
     ann.situation("paused")
     me.test("resume-ann").click()
@@ -98,7 +98,7 @@ def test_a_new_guideline_is_put_before_people_at_work(text_house: House, visit: 
     for number, notice in enumerate(("before you begin", "has changed")):
         me.test("guideline-edit").fill(f"Look **twice**, {number}.")
         me.test("save-guideline").click()
-        expect(ann.test("guideline-dialog")).to_contain_text(notice, timeout=10_000)
+        expect(ann.test("guideline-dialog")).to_contain_text(notice)
         expect(ann.test("guideline-dialog")).to_contain_text(f"Look twice, {number}.")
         ann.test("guideline-read").click()
     ann.page.reload()
@@ -138,7 +138,7 @@ def test_a_text_that_must_be_agreed_to_comes_up_while_somebody_is_at_work(text_h
     ann = visit(text_house.link("ann"))
     ann.press("1")
     text_house.service.consent.text, text_house.service.consent.version = "New terms.", "1"
-    expect(ann.test("consent")).to_contain_text("New terms.", timeout=10_000)
+    expect(ann.test("consent")).to_contain_text("New terms.")
     ann.test("agree").click()
     ann.press("2")
     ann.saved()

@@ -9,7 +9,7 @@ from browser.house import House, Open, fill, texts
 from browser.visitor import Visit, Visitor
 from playwright.sync_api import expect
 
-from prefrl.types import Ranking
+from prefrl.judgements import Ranking
 
 pytestmark = pytest.mark.browser
 

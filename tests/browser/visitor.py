@@ -98,7 +98,7 @@ class Visitor:
 
     def saved(self) -> None:
         """Wait until the page says that everything is saved."""
-        expect(self.test("save-state")).to_have_attribute("data-state", "saved", timeout=20_000)
+        expect(self.test("save-state")).to_have_attribute("data-state", "saved")
 
     def test(self, id: str) -> Any:
         return self.page.get_by_test_id(id)
@@ -141,7 +141,7 @@ def enter(browser: Browser, link: str, wait: bool = True, **options: Any) -> Vis
     """Open a link in a new browser window, and wait until the page knows who it is."""
     options = {"viewport": {"width": 1280, "height": 800}, "locale": "en-GB"} | options
     context = browser.new_context(**options)
-    context.set_default_timeout(15_000)
+    context.set_default_timeout(30_000)
     visitor = Visitor(context, context.new_page(), origin_of(link))
     visitor.watch()
     visitor.page.goto(link)

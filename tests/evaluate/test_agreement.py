@@ -9,7 +9,8 @@ from scipy.special import logit
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, hits, kappa, labeler_part, member_part
 from prefrl.evaluate.drift import drift, first_judged
 from prefrl.fit.metrics import accuracy
-from prefrl.types import Comparison, Judged, Query, Response
+from prefrl.judgements import Comparison, Judged
+from prefrl.types import Query, Response
 
 
 def pairs(predicted: list[float], preference: list[float], **more: list[float]) -> Pairs:

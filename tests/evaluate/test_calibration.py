@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prefrl.evaluate.calibration import reliability, wilson
+from prefrl.evaluate.calibration import reliability
+from prefrl.stats.estimates import wilson
 
 
 def test_bins_by_hand() -> None:

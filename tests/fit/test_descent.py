@@ -10,7 +10,8 @@ from prefrl.fit.descent import UNJUDGED, Problem, _Descent, ensemble_loss
 from prefrl.fit.likelihood import Likelihood
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.terms import terms
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
+from prefrl.types import Query, Segment
 
 
 class Given:

@@ -6,7 +6,7 @@ import torch
 
 from prefrl.fit.losses import davidson, rao_kupper
 from prefrl.fit.metrics import Answering, accuracy, brier, calibration_error, log_losses, temperature
-from prefrl.fit.terms import Ties
+from prefrl.fit.settings import Ties
 
 
 def test_accuracy_leaves_ties_out_and_gives_half_for_an_even_prediction() -> None:
@@ -36,6 +36,16 @@ def test_a_calibrated_prediction_has_no_calibration_error(rng: np.random.Generat
 def test_calibration_does_not_depend_on_which_candidate_comes_first(rng: np.random.Generator) -> None:
     predicted, preference = rng.uniform(size=100), rng.integers(0, 2, 100).astype(float)
     assert calibration_error(predicted, preference) == pytest.approx(calibration_error(1 - predicted, 1 - preference))
+
+
+def test_a_calibration_error_is_the_same_whichever_comparisons_are_turned_round() -> None:
+    """Two favourites at 0.9 of which one wins and one wins four times of five: 0.9 on average, as predicted."""
+    predicted, preference = np.array([0.9, 0.9]), np.array([1.0, 0.8])
+    assert calibration_error(predicted, preference) == pytest.approx(0.0)
+    turned = np.array([False, True])
+    assert calibration_error(
+        np.where(turned, 1 - predicted, predicted), np.where(turned, 1 - preference, preference)
+    ) == pytest.approx(0.0)
 
 
 def test_a_temperature_finds_by_how_much_logits_are_too_large(rng: np.random.Generator) -> None:

@@ -5,7 +5,8 @@ import torch
 
 from prefrl.fit.noise import Discriminator, flipped
 from prefrl.fit.terms import terms
-from prefrl.types import Comparison, Judged, Query, Ranking, Response
+from prefrl.judgements import Comparison, Judged, Ranking
+from prefrl.types import Query, Response
 
 
 def test_a_model_that_knows_nothing_trusts_everybody() -> None:

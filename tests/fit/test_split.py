@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from prefrl.fit.split import prefers, split
-from prefrl.types import Comparison, Judged, Judgement, Query, Ranking, Rating, Segment
+from prefrl.judgements import Comparison, Judged, Judgement, Ranking, Rating
+from prefrl.types import Query, Segment
 
 
 def compare(query: Query[Segment]) -> Judged[Segment]:

@@ -10,7 +10,8 @@ import torch
 
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
 from prefrl.fit.terms import Terms, terms
-from prefrl.types import Choice, Comparison, Judged, Judgement, Query, Ranking, Rating, Response
+from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating
+from prefrl.types import Query, Response
 
 
 def candidates(count: int) -> list[Response]:

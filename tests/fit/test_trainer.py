@@ -8,12 +8,14 @@ import torch
 from scipy.stats import pearsonr
 
 from prefrl.components import ConfigError, settings_class
+from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
+from prefrl.fit.split import split
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
-from prefrl.graph import batch
+from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
-from prefrl.types import Choice, Comparison, Judged, Query, Ranking, Rating, Segment
+from prefrl.types import Query, Segment
 
 WEIGHTS = np.array([1.0, -2.0, 0.5, 1.0, 0.0])
 
@@ -459,11 +461,27 @@ def test_the_model_is_calibrated_by_the_temperature_that_is_reported(judged: lis
 
 
 def test_training_metrics_are_of_training_judgements_alone(judged: list[Judged[Segment]]) -> None:
-    metrics = fit_judged(
-        model(1), judged[:40], FittingSettings(epochs=300, held_out=0.3), np.random.default_rng(0)
-    ).metrics
+    settings = FittingSettings(epochs=300, held_out=0.3)
+    out = split(judged[:40], settings.held_out)
+    turned = [reversed_answer(j) if held_out else j for j, held_out in zip(judged, out, strict=False)]
+    metrics = fit_judged(model(1), turned, settings, np.random.default_rng(0)).metrics
     assert metrics["accuracy"] == 1.0
-    assert metrics["accuracy_held_out"] < 1.0
+    assert metrics["accuracy_held_out"] < 0.5
+
+
+def test_the_temperature_is_that_of_judgements_that_were_held_out(judged: list[Judged[Segment]]) -> None:
+    """A model that fits what it was trained on, and is wrong on all else, is to be far less sure."""
+    settings = FittingSettings(epochs=60, held_out=0.3)
+    out = split(judged[:40], settings.held_out)
+    turned = [reversed_answer(j) if held_out else j for j, held_out in zip(judged, out, strict=False)]
+    metrics = fit_judged(model(1), turned, settings, np.random.default_rng(0)).metrics
+    assert metrics["loss"] < 0.2  # it could be surer still of these
+    assert metrics["temperature"] > 3.0
+
+
+def reversed_answer(one: Judged[Segment]) -> Judged[Segment]:
+    assert isinstance(one.judgement, Comparison)
+    return Judged(one.query, Comparison(one.query.id, 1 - one.judgement.preference))
 
 
 def test_judgements_that_contradict_each_other_balance(judged: list[Judged[Segment]]) -> None:

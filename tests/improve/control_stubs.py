@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from prefrl.envs.control import GymnasiumTask
-from prefrl.envs.fast.classic import Bools, Vectorised
+from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.protocols import Environments, Transition
-from prefrl.types import Floats, Segment, State
+from prefrl.types import Bools, Floats, Segment, State
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,19 @@ class Point:
     def start(self, count: int, rng: np.random.Generator) -> Floats:
         return rng.uniform(-1.0, 1.0, (count, 1))
 
-    def advance(self, states: Floats, actions: Floats) -> tuple[Floats, Floats, Bools]:
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         push = actions[:, 0] if actions.shape[1] == 1 else actions @ np.array([-1.0, 1.0])
         moved = np.clip(states[:, 0] + 0.2 * push, -2.0, 2.0)
         return moved[:, None], -np.abs(moved), np.zeros(len(states), bool)
 
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray | None:
+        return None
 
 
 @dataclass
@@ -44,6 +50,9 @@ class Watched:
 
     def states(self) -> Floats | None:
         return self.inner.states()
+
+    def legal(self) -> Bools | None:
+        return self.inner.legal()
 
     def step(self, actions: Floats) -> Transition:
         self.spent.append(self.count)
@@ -72,6 +81,8 @@ class Known:
 
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return []
+
+    def to(self, device: torch.device) -> None: ...
 
     def settle(self, stacked: Mapping[str, torch.Tensor], loss: object) -> torch.Tensor:
         raise NotImplementedError

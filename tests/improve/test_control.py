@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from pydantic import ValidationError
 
-from prefrl.checkpoints import load_state, save_state
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
-from prefrl.improve.control import PPO, PPOSettings
-from prefrl.improve.rollout import Rollout
+from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.policies.rollout import Rollout
 from prefrl.reward_models.mlp import MLPSettings
+from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
 from prefrl.types import Segment, Steps
 
@@ -32,11 +34,11 @@ SMALL: dict[str, Any] = {
 }
 
 
-def _learner(task: GymnasiumTask, seed: int = 0, **settings: object) -> PPO:
-    return PPOSettings.model_validate({**SMALL, **settings}).build(task, np.random.default_rng(seed))
+def _learner(task: GymnasiumTask, seed: int = 0, **settings: object) -> ControlLearner:
+    return ControlLearnerSettings.model_validate({**SMALL, **settings}).build(task, np.random.default_rng(seed))
 
 
-def _bytes(learner: PPO) -> bytes:
+def _bytes(learner: ControlLearner) -> bytes:
     state = learner.policy.state()
     arrays = [*(p.numpy() for p in state["parameters"].values()), state["mean"], state["variance"]]
     return b"".join(a.tobytes() for a in arrays)
@@ -153,12 +155,12 @@ def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_do
     )
     with torch.no_grad():
         policy = learner.policy
-        values = policy.values(torch.from_numpy(policy.normalise(rollout.observations)))
+        values = policy.values_of(torch.from_numpy(policy.normalise(rollout.observations)))
         found = learner._next_values(rollout, values)
 
         def value(x: float) -> float:
             inputs = torch.from_numpy(policy.normalise(np.array([[x]], np.float32)))
-            return float(policy.values(inputs).detach())
+            return float(policy.values_of(inputs).detach())
 
     assert found[0].tolist() == pytest.approx([value(0.2), value(0.8), 0.0, value(0.5)], abs=1e-6)
 
@@ -191,7 +193,7 @@ def test_it_learns_from_a_fitted_ensemble(store: Store[Segment]) -> None:
 
 def test_steps_that_do_not_divide_are_refused_with_both_numbers() -> None:
     with pytest.raises(ValidationError, match="got 1000 and 16"):
-        PPOSettings(steps_per_round=1000)
+        ControlLearnerSettings(steps_per_round=1000)
 
 
 def test_a_text_task_is_refused() -> None:
@@ -199,7 +201,7 @@ def test_a_text_task_is_refused() -> None:
         name, kind = "reviews", "text"
 
     with pytest.raises(ConfigError, match="'text'"):
-        PPOSettings().build(Text(), np.random.default_rng(0))
+        ControlLearnerSettings().build(Text(), np.random.default_rng(0))
 
 
 def test_a_reward_model_without_step_rewards_is_refused(store: Store[Segment]) -> None:
@@ -211,17 +213,35 @@ def test_a_reward_model_without_step_rewards_is_refused(store: Store[Segment]) -
 
 
 def test_the_formula_says_what_is_optimised() -> None:
-    assert "clip(r, 0.8, 1.2)" in PPOSettings().formula()
-    assert "log pi(a|s) A" in PPOSettings(clip=None).formula()
+    assert "clip(r, 0.8, 1.2)" in ControlLearnerSettings().formula()
+    assert "log pi(a|s) A" in ControlLearnerSettings(clip=None).formula()
 
 
-def test_the_learning_rate_follows_the_kl() -> None:
-    learner = _learner(point(), target_kl=0.01, learning_rate=1e-3)
-    group = learner._optimizer.param_groups[0]
-    learner._steer(0.05)
-    assert group["lr"] == pytest.approx(1e-3 / 1.5)
-    learner._steer(0.01)
-    assert group["lr"] == pytest.approx(1e-3 / 1.5)
-    for _ in range(20):
-        learner._steer(0.0)
-    assert group["lr"] == pytest.approx(1e-2)
+def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> None:
+    assert ControlLearnerSettings() == ControlLearnerSettings(algorithm="ppo")
+    plain = ControlLearnerSettings(algorithm="reinforce", trace=0.9)
+    assert (plain.clip, plain.epochs, plain.trace) == (None, 1, 0.9)
+    assert ControlLearnerSettings.model_validate(plain.model_dump()) == plain
+    assert ControlLearnerSettings(algorithm="a2c").rollout_steps == 16
+
+
+def test_it_learns_where_some_moves_are_not_legal(store: Store[Segment]) -> None:
+    learner = _learner(corridor(), seed=1, steps_per_round=800, epochs=4, discount=0.9, learning_rate=1e-2)
+    reward = Known(lambda observations, actions: observations[..., 0])
+    before = learner.evaluate(reward, np.random.default_rng(9)).metrics["gold"]
+    metrics = [learner.improve(reward, store, np.random.default_rng(number)) for number in range(2)]
+    assert learner.evaluate(reward, np.random.default_rng(9)).metrics["gold"] > max(before, 28.0)  # 36 at the most
+    assert all(m["ratio_error"] < 1e-5 for m in metrics)
+    assert metrics[0]["entropy"] < np.log(3)
+
+
+def test_the_legal_moves_of_a_rollout_are_kept_and_saved(store: Store[Segment], tmp_path: Path) -> None:
+    learner = _learner(corridor(), steps_per_round=40)
+    learner.improve(Known(), store, np.random.default_rng(0))
+    recent = learner.state()["recent"]
+    np.testing.assert_array_equal(recent["legal"][..., 0], recent["observations"][..., 0] > 0)
+    assert (recent["choices"] * ~recent["legal"]).sum() == 0.0
+    save_state(tmp_path, "learner", learner.state())
+    other = _learner(corridor(), seed=1, steps_per_round=40)
+    other.load(load_state(tmp_path, "learner"))
+    np.testing.assert_array_equal(other.state()["recent"]["legal"], recent["legal"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -9,19 +10,20 @@ import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from stable_baselines3 import PPO as SB3PPO
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from prefrl.checkpoints import load_state, save_state
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.rollout import learned_rewards
-from prefrl.improve.sb3 import SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
+from prefrl.improve.sb3 import ALGORITHMS, SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
+from prefrl.policies.rollout import learned_rewards
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
+from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
 from prefrl.types import Floats, Segment, Steps
 
@@ -41,6 +43,26 @@ def _learner(task: GymnasiumTask, algorithm: dict[str, Any], seed: int = 0, **se
 
 def _bytes(learner: SB3) -> bytes:
     return b"".join(p.detach().numpy().tobytes() for p in learner.model.policy.parameters())
+
+
+def test_the_discount_is_what_stable_baselines3_calls_gamma() -> None:
+    assert SB3Settings(options={"gamma": 0.9}).discount == 0.9
+    for name, algorithm in ALGORITHMS.items():
+        default = signature(algorithm).parameters["gamma"].default
+        assert SB3Settings.model_validate({"algorithm": name}).discount == default
+
+
+@both
+def test_the_algorithm_computes_on_the_device_that_the_settings_name(
+    algorithm: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[torch.device] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    name = algorithm["algorithm"]
+    monkeypatch.setitem(ALGORITHMS, name, lambda *_, device, **__: made.append(device))
+    for device in ("cpu", "cuda", "auto"):
+        _learner(point(), algorithm, device=device)
+    assert [device.type for device in made] == ["cpu", "cuda", "cuda"]
 
 
 @both
@@ -114,6 +136,15 @@ def test_the_replay_holds_the_newest_rewards_whole_and_never_the_gold(store: Sto
     assert buffer.full
     relabel(buffer, Known(lambda o, a: 3.0 * o[..., 0] + a[..., 0]))
     np.testing.assert_allclose(buffer.rewards, 3.0 * buffer.observations[..., 0] + buffer.actions[..., 0], atol=1e-6)
+
+
+def test_each_round_begins_by_scoring_what_is_replayed_anew(store: Store[Segment]) -> None:
+    learner = _learner(point(), {**SAC_, "options": {**SAC_["options"], "buffer_size": 1000}})
+    learner.improve(Known(lambda o, a: o[..., 0]), store, np.random.default_rng(0))
+    learner.improve(Known(lambda o, a: 7.0 - o[..., 0]), store, np.random.default_rng(1))
+    buffer = learner.model.replay_buffer
+    assert buffer.size() == 80  # both rounds, of 40 steps in each of two environments
+    np.testing.assert_allclose(buffer.rewards[:80], 7.0 - buffer.observations[:80, :, 0], atol=1e-6)
 
 
 def test_relabelling_sees_actions_as_they_were_executed() -> None:
@@ -262,3 +293,9 @@ def test_relabelling_follows_the_ring_through_ends_and_resets() -> None:
         place = 50.0 if t == 8 else place + 1  # a reset without an end, as between two rounds
     relabel(buffer, Ageing())  # type: ignore[arg-type]
     assert buffer.rewards[:, 0].tolist() == [3, 1, 2, 1, 2, 3, 1, 2]
+
+
+def test_an_algorithm_that_does_not_know_legal_moves_is_stopped_at_the_first_that_is_not() -> None:
+    learner = _learner(corridor(), PPO)
+    with pytest.raises(ValueError, match=r"is not legal there; .* learner.kind=control"):
+        learner.sample(10, np.random.default_rng(0))

@@ -11,9 +11,8 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.formula import text_formula
-from prefrl.improve.responses import Responses, check_head
-from prefrl.improve.text import TextLearner, TextSettings, advantages_of
+from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
+from prefrl.policies.language import Responses, check_head
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
 
@@ -41,7 +40,7 @@ def reward(token: int = 5, constant: float | None = None) -> RewardModel[Respons
 
 
 def learner(task: Reviews, **changes: object) -> TextLearner:
-    settings = TextSettings.model_validate({**SMALL, **changes})
+    settings = TextLearnerSettings.model_validate({**SMALL, **changes})
     return settings.build(task, np.random.default_rng(0))
 
 
@@ -92,17 +91,25 @@ def test_the_same_seed_gives_the_same_bytes_and_a_resumed_learner_goes_on_alike(
     first.improve(likes, NO_STORE, np.random.default_rng(1))
     second.load(first.state())
     second.improve(likes, NO_STORE, np.random.default_rng(2))
-    assert torch.equal(flat(whole.model), flat(second.model))
+    assert torch.equal(flat(whole.policy.model), flat(second.policy.model))
     assert whole.steps == second.steps
     assert whole.state()["beta"] == second.state()["beta"]
 
 
+@pytest.mark.parametrize("beta", [0.0, 0.3])
+def test_a_kl_that_was_not_measured_is_absent(toy_reviews: Reviews, beta: float) -> None:
+    one = learner(toy_reviews, updates=2, learning_rate=5e-3, beta=beta)
+    metrics = one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    assert ("kl" in metrics) == (beta > 0)
+    assert metrics.get("kl") != 0.0
+
+
 def test_gold_is_neither_read_nor_attached_while_learning(toy_reviews: Reviews) -> None:
     blind = _WithoutGold(toy_reviews)
-    seeing, unseeing = learner(toy_reviews), TextSettings(**SMALL).build(blind, np.random.default_rng(0))
+    seeing, unseeing = learner(toy_reviews), TextLearnerSettings(**SMALL).build(blind, np.random.default_rng(0))
     for one in (seeing, unseeing):
         one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
-    assert torch.equal(flat(seeing.model), flat(unseeing.model))
+    assert torch.equal(flat(seeing.policy.model), flat(unseeing.policy.model))
     likes = Rewarded()
     seeing.improve(cast("RewardModel[Response]", likes), NO_STORE, np.random.default_rng(2))
     assert all(r.gold is None for r in likes.seen)
@@ -168,7 +175,7 @@ def test_evaluation_does_not_change_what_is_learned(toy_reviews: Reviews) -> Non
     evaluated.sample(4, np.random.default_rng(0))
     for one in (plain, evaluated):
         one.improve(likes, NO_STORE, np.random.default_rng(1))
-    assert torch.equal(flat(plain.model), flat(evaluated.model))
+    assert torch.equal(flat(plain.policy.model), flat(evaluated.policy.model))
 
 
 def test_the_kl_penalty_keeps_the_policy_near_its_start(toy_reviews: Reviews) -> None:
@@ -184,8 +191,8 @@ def test_the_reference_is_not_run_while_its_weight_is_zero(toy_reviews: Reviews)
     runs = []
     for beta in (0.0, 0.1):
         one = learner(toy_reviews, beta=beta)
-        one._reference.register_forward_pre_hook(lambda *_: runs.append(1))
-        one._reference.base_model.register_forward_pre_hook(lambda *_: runs.append(1))
+        one.policy.start.register_forward_pre_hook(lambda *_: runs.append(1))
+        one.policy.start.base_model.register_forward_pre_hook(lambda *_: runs.append(1))
         one.improve(reward(), NO_STORE, np.random.default_rng(0))
         assert bool(runs) == (beta > 0)
 
@@ -200,9 +207,9 @@ def test_responses_without_an_end_are_penalised(toy_reviews: Reviews) -> None:
 
 def test_equal_rewards_teach_nothing(toy_reviews: Reviews) -> None:
     one = learner(toy_reviews, beta=0.0, missing_end_penalty=0.0)
-    before = flat(one.model)
+    before = flat(one.policy.model)
     one.improve(reward(constant=3.0), NO_STORE, np.random.default_rng(1))
-    assert torch.equal(before, flat(one.model))
+    assert torch.equal(before, flat(one.policy.model))
 
 
 def test_the_size_of_a_chunk_changes_the_gradient_by_rounding_only(toy_reviews: Reviews) -> None:
@@ -217,7 +224,7 @@ def test_the_size_of_a_chunk_changes_the_gradient_by_rounding_only(toy_reviews: 
 def test_no_dropout_and_no_training_mode(toy_reviews: Reviews) -> None:
     one = learner(toy_reviews)
     one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
-    assert not any(m.training for m in [*one.model.modules(), *one._reference.modules()])
+    assert not any(m.training for m in [*one.policy.model.modules(), *one.policy.start.modules()])
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -237,7 +244,7 @@ def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Re
 )
 def test_settings_that_contradict_each_other_are_errors(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        TextSettings.model_validate(changes)
+        TextLearnerSettings.model_validate(changes)
 
 
 def test_a_control_task_is_refused() -> None:
@@ -245,7 +252,7 @@ def test_a_control_task_is_refused() -> None:
         name, kind = "pendulum", "control"
 
     with pytest.raises(ConfigError, match="writes text"):
-        TextSettings().build(Control(), np.random.default_rng(0))
+        TextLearnerSettings().build(Control(), np.random.default_rng(0))
 
 
 def test_a_state_of_another_size_is_refused(toy_reviews: Reviews) -> None:
@@ -271,17 +278,17 @@ def replace_logits(out: Any) -> Any:
     return out
 
 
-def test_rows_and_chunks_keep_what_belongs_together() -> None:
+def test_rows_and_parts_keep_what_belongs_together() -> None:
     mask = torch.tensor([[1, 1, 1], [1, 0, 0], [1, 1, 0]]).bool()
     tokens = torch.tensor([[1, 2, 3], [4, 0, 0], [5, 6, 0]])
     rows = Responses(("a", "b", "c"), ((7,), (8, 8, 8, 8), (9,)), tokens, mask, tokens * 0.1, mask[:, 2])
     assert rows.count == 6
     seen = {}
-    for at, some in rows.chunks(2):
+    for at, some in rows.parts(2):
         for i, j in enumerate(at.tolist()):
             seen[j] = (some.prompts[i], some.prompt_tokens[i], some.tokens[i, some.mask[i]].tolist())
     assert seen == {0: ("a", (7,), [1, 2, 3]), 1: ("b", (8, 8, 8, 8), [4]), 2: ("c", (9,), [5, 6])}
-    (short,) = [some for at, some in rows.chunks(1) if at.tolist() == [1]]
+    (short,) = [some for at, some in rows.parts(1) if at.tolist() == [1]]
     assert short.tokens.shape == (1, 1)
 
 
@@ -295,10 +302,20 @@ def test_advantages_by_hand() -> None:
 
 
 def test_the_formula_says_what_the_settings_say() -> None:
-    plain = text_formula(TextSettings(beta=0.05))
+    plain = text_formula(TextLearnerSettings(beta=0.05))
     assert "mean_i sum_t [ log pi(y_t) A_i ]" in plain
     assert "mean of the prompt's other R_j" in plain
     assert "- 0.05 sum_t [log pi_old(y_t) - log ref(y_t)]" in plain
-    other = TextSettings(clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised")
+    other = TextLearnerSettings(
+        clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised"
+    )
     assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 (log pi(y_t) - log ref(y_t))^2 / 2" in other.formula()
-    assert "ref" not in text_formula(TextSettings(beta=0.0))
+    assert "ref" not in text_formula(TextLearnerSettings(beta=0.0))
+
+
+def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> None:
+    assert TextLearnerSettings() == TextLearnerSettings(algorithm="rloo")
+    grpo = TextLearnerSettings(algorithm="grpo", kl_in="reward")
+    assert (grpo.advantage, grpo.clip, grpo.kl_in, grpo.reduction) == ("group_normalised", 0.2, "reward", "sequence")
+    assert TextLearnerSettings.model_validate(grpo.model_dump()) == grpo
+    assert TextLearnerSettings(algorithm="reinforce").advantage == "batch_mean"

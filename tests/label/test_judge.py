@@ -21,12 +21,13 @@ from transformers import (
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.envs.cloning import make_tokenizer
 from prefrl.envs.toys import PointSettings
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.label.judge import Judge, JudgeSettings, Verdict, bias
 from prefrl.label.prompts import Prompter, answer_tokens, fence_for, verdict
+from prefrl.policies.cloning import make_tokenizer
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 SHORT = "{prompt}\n{first}\n{second}\n{criterion} Answer:"
 CHAT = "{{ '<bos>' }}{% for m in messages %}[{{ m.role }}] {{ m.content }}<eos>{% endfor %}[assistant] "
@@ -301,7 +302,7 @@ def test_the_starting_policy_judges_when_no_model_is_named(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"model": "/no/such/folder"}, "no causal model could be read"),
+        ({"model": "/no/such/folder"}, "no model in safetensors could be read"),
         ({"answers": ("good film", "B")}, "no single token"),
         ({"answers": ("A", "A")}, "expected two that differ"),
     ],

@@ -9,10 +9,11 @@ from pydantic import ValidationError
 from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
+from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.label.crowd import Crowd, CrowdSettings
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
-from prefrl.types import Answer, Choice, Comparison, Query, Ranking, Rating, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 Ask = Callable[..., Query[Segment]]
 Pairs = Callable[[int], list[Query[Segment]]]

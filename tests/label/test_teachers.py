@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from prefrl.judgements import Answer, Comparison, Ranking, Rating, Skip
 from prefrl.label import teachers
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.label.teachers import Limits, Survey
-from prefrl.types import Answer, Comparison, Query, Ranking, Rating, Response, Skip
+from prefrl.types import Query, Response
 
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 GOLDS: dict[str, Draw] = {

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from prefrl.label.clips import side_by_side, write_clip
+from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.label.terminal import Stopped, Terminal, TerminalSettings, interpret, understood
+from prefrl.page.clips.encode import side_by_side, write_clip
 from prefrl.store import Store
-from prefrl.types import Comparison, Query, Ranking, Response, Segment, Skip
+from prefrl.types import Query, Response, Segment
 
 
 class Task:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,9 +18,9 @@ from starlette.testclient import TestClient
 from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
-from prefrl.label.server import serve
-from prefrl.label.server.site import hosts, warnings
 from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.page import serve
+from prefrl.page.site import Address
 from prefrl.protocols import Attended
 from prefrl.rundir import Run, RunError
 from prefrl.stages import label
@@ -30,7 +29,7 @@ from prefrl.store import Store
 from prefrl.types import Query, Segment
 
 Come = Callable[[str], httpx.Client]
-SOON = 20.0
+SOON = 40.0
 """Seconds in which everything here must have happened, on a machine that does other things too."""
 
 
@@ -116,13 +115,13 @@ def test_presets_take_it_and_the_settings_come_back_as_they_were() -> None:
 
 
 def test_only_names_that_were_allowed_reach_the_page_and_open_pages_are_warned_about() -> None:
-    assert hosts(labeler()) == {"127.0.0.1", "localhost", "[::1]"}
-    assert warnings(labeler()) == []
-    everywhere = labeler(host="0.0.0.0", allowed_hosts=("Lab.example.org",))
-    assert "lab.example.org" in hosts(everywhere)
-    assert "0.0.0.0" not in hosts(everywhere)
-    assert "without TLS" in " ".join(warnings(everywhere))
-    assert "allowed_hosts" in " ".join(warnings(labeler(host="0.0.0.0")))
+    assert Address().names() == {"127.0.0.1", "localhost", "[::1]"}
+    assert Address().warnings() == []
+    everywhere = Address("0.0.0.0", allowed_hosts=("Lab.example.org",))
+    assert "lab.example.org" in everywhere.names()
+    assert "0.0.0.0" not in everywhere.names()
+    assert "without TLS" in " ".join(everywhere.warnings())
+    assert "allowed_hosts" in " ".join(Address("0.0.0.0").warnings())
 
 
 # --- the labeler ---------------------------------------------------------------------------------------------------
@@ -221,15 +220,14 @@ def test_a_run_goes_on_at_another_address_and_with_no_other_setting(tmp_path: Pa
         Run(Config.load("control/toy", (*web, "labeler.enough=0.9")), tmp_path / "run")
 
 
-def test_closing_takes_seconds_even_with_open_connections(
+def test_closing_does_not_wait_for_open_connections(
     come: Come, asked: Store[Segment], opened: tuple[WebLabeler, str]
 ) -> None:
     made, address = opened
     client = come(address)
     client.get("/healthz")
-    begin = time.monotonic()
     made.close()
-    assert time.monotonic() - begin < 5
+    assert not [t for t in threading.enumerate() if t.name.startswith("prefrl-")], "it waits for the connection"
     with pytest.raises(httpx.HTTPError):
         client.get("/healthz")
 

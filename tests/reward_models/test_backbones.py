@@ -69,13 +69,13 @@ def test_encoders_are_pooled_as_asked_and_not_exported(toy_reviews: Reviews, tmp
     first = own(toy_reviews, tmp_path / "b", models()["bert"], train="head", pool="first")
     assert np.abs(mean.features(probes) - first.features(probes)).max() > 1e-3
     with pytest.raises(ValueError, match="encoder"):
-        save_classifier(mean, tmp_path / "out")
+        save_classifier(mean.backbone, *mean.mean_head(), tmp_path / "out")
 
 
 @pytest.mark.parametrize("kind", ["bloom", "gpt_neo"])
 def test_backbones_with_attention_of_their_own_are_exported(toy_reviews: Reviews, tmp_path: Path, kind: str) -> None:
     reward, probes = own(toy_reviews, tmp_path / "b", models()[kind]), some(toy_reviews, 8)
-    constant = save_classifier(reward, tmp_path / "c")
+    constant = save_classifier(reward.backbone, *reward.mean_head(), tmp_path / "c")
     found = logits(tmp_path / "c", reward.backbone.rows(probes)) + constant
     np.testing.assert_allclose(found, reward.member_scores(probes).mean(0), atol=1e-4)
 
@@ -104,7 +104,7 @@ def test_an_encoder_s_classifier_is_read_fitted_and_written_with_all_its_head(
             assert parameter.grad is not None
             parameter.sub_(parameter.grad.sign() * 1e-3)
     reward.settle(reward.stack(probes), no_loss)
-    assert save_classifier(reward, tmp_path / "out") == 0
+    assert save_classifier(reward.backbone, *reward.mean_head(), tmp_path / "out") == 0
     assert np.abs(reward.score(probes) - before).max() > 0.1
     np.testing.assert_allclose(logits(tmp_path / "out", rows), reward.score(probes), atol=1e-4)
     again = settings.build(toy_reviews, np.random.default_rng(1))

@@ -14,10 +14,12 @@ from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.improve.rollout import Rollout, collect, cut
+from prefrl.judgements import Comparison, Judged
+from prefrl.policies.rollout import Rollout, collect
 from prefrl.reward_models.cnn import CNN, CNNSettings
 from prefrl.reward_models.steps import StepReward
-from prefrl.types import Comparison, Floats, Judged, Query, Segment, gold_score
+from prefrl.sample.segments import cut
+from prefrl.types import Bools, Floats, Query, Segment, gold_score
 
 IMAGE = (8, 6, 2)
 
@@ -57,7 +59,7 @@ def _model(task: GymnasiumTask, **settings: Any) -> StepReward:
 def _rollout(task: GymnasiumTask, count: int = 8, steps: int = 60) -> Rollout:
     rng, envs = np.random.default_rng(0), task.environments(count)
 
-    def act(observations: Floats) -> tuple[Floats, Floats]:
+    def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
         actions = rng.uniform(-1, 1, (count, 1)).astype(np.float32)
         return actions, actions
 

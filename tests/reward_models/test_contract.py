@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch.nn.functional import softplus
 
-from prefrl.checkpoints import load_state, save_state
 from prefrl.components import TABLE, ConfigError, settings_class
 from prefrl.protocols import StepRewardModel
+from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.types import Segment
 
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -36,7 +36,7 @@ def test_an_exported_classifier_scores_probes_as_the_members_mean(
 ) -> None:
     reward, probes = fitted(toy_reviews, train), some(toy_reviews, 8, seed=9)
     before = reward.score(probes)
-    constant = save_classifier(reward, tmp_path / "classifier")
+    constant = save_classifier(reward.backbone, *reward.mean_head(), tmp_path / "classifier")
     found = logits(tmp_path / "classifier", reward.backbone.rows(probes)) + constant
     np.testing.assert_allclose(found, reward.member_scores(probes).mean(0), atol=1e-4)
     assert reward.score(probes).tobytes() == before.tobytes()
@@ -50,7 +50,7 @@ def test_padding_that_could_be_the_end_gets_a_token_of_its_own(
     reward, probes = fitted(toy_reviews), some(toy_reviews, 8)
     reward.backbone.tokenizer.pad_token, kept = pad, reward.backbone.tokenizer.pad_token
     try:
-        constant = save_classifier(reward, tmp_path / "c")
+        constant = save_classifier(reward.backbone, *reward.mean_head(), tmp_path / "c")
     finally:
         reward.backbone.tokenizer.pad_token = kept
     found = logits(tmp_path / "c", reward.backbone.rows(probes)) + constant
@@ -59,7 +59,7 @@ def test_padding_that_could_be_the_end_gets_a_token_of_its_own(
 
 def test_a_classifier_comes_back_as_a_fitted_reward_model(toy_reviews: Reviews, tmp_path: Path) -> None:
     reward, probes = fitted(toy_reviews), some(toy_reviews, 8)
-    constant = save_classifier(reward, tmp_path / "c")
+    constant = save_classifier(reward.backbone, *reward.mean_head(), tmp_path / "c")
     settings = TransformerSettings(checkpoint=str(tmp_path / "c"), members=1)
     again = settings.build(toy_reviews, np.random.default_rng(0))
     assert again.fitted
@@ -122,7 +122,7 @@ def test_a_checkpoint_reads_by_its_chat_template_and_one_fitted_without_is_writt
     for wanted in (None, False):
         settings = TransformerSettings(checkpoint=str(tmp_path / "a"), members=1, chat_template=wanted)
         reward = settings.build(toy_reviews, np.random.default_rng(0))
-        save_classifier(reward, tmp_path / str(wanted))
+        save_classifier(reward.backbone, *reward.mean_head(), tmp_path / str(wanted))
         settings = TransformerSettings(checkpoint=str(tmp_path / str(wanted)), members=1)
         again = settings.build(toy_reviews, np.random.default_rng(0))
         rows.append(again.backbone.rows(probes))

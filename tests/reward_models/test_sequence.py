@@ -14,10 +14,10 @@ from prefrl.components import ConfigError, settings_class
 from prefrl.envs.control import ControlSettings
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.reward_models.history import windows
+from prefrl.judgements import Comparison, Judged
 from prefrl.reward_models.sequence import GRU, PreferenceTransformerSettings
-from prefrl.reward_models.steps import StepReward
-from prefrl.types import Comparison, Floats, Judged, Query, Segment
+from prefrl.reward_models.steps import StepReward, windows
+from prefrl.types import Floats, Query, Segment
 
 KINDS: list[tuple[str, dict[str, Any]]] = [
     ("gru", {"width": 8}),

@@ -6,7 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from prefrl.envs.fast.classic import CartPole, Pendulum, Vectorised
+from prefrl.envs.fast.classic import CartPole, Pendulum
+from prefrl.envs.fast.vectorised import Vectorised
 
 
 def _reference(name: str, states: np.ndarray) -> list[Any]:

@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from prefrl.envs.fast.classic import Pendulum, Vectorised
+from prefrl.envs.fast.classic import Pendulum
+from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.fast.wrapped import Wrapped
 
 make_pendulum = partial(gymnasium.make, "Pendulum-v1", max_episode_steps=5, disable_env_checker=True)

@@ -1,0 +1,209 @@
+"""What a person sees in the terminal: progress while a run goes on, a line for each round, tables."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import astuple
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Task as Row
+from rich.table import Table
+from rich.text import Text
+
+from prefrl.evaluate.card import ReportCard
+from prefrl.kinds import find, named
+from prefrl.loop import Loop
+from prefrl.report import card_words
+from prefrl.types import Round
+
+if TYPE_CHECKING:
+    from prefrl.rundir import Run
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+
+class _Stage(ProgressColumn):
+    """What goes on now, and how fast; read off the loop, which knows nothing of it."""
+
+    def __init__(self, loop: Loop[Any]) -> None:
+        super().__init__()
+        self.loop = loop
+        self.unit = f"{named(loop.task.kind).step}s"
+
+    def render(self, task: Row) -> Text:
+        spent = sum(self.loop.learner.steps)
+        rate = (spent - task.fields["spent"]) / task.elapsed if task.elapsed else 0.0
+        return Text(f"{self.loop.stage:<9} {spent:>10,} {self.unit} {rate:>8,.0f}/s", style="cyan")
+
+
+@contextmanager
+def progress(loop: Loop[Any], quiet: bool) -> Iterator[Progress]:
+    """A bar over the rounds on a terminal; nothing elsewhere, or while a person is asked questions."""
+    columns = (SpinnerColumn(), TextColumn("round {task.completed:.0f}/{task.total:.0f}"), BarColumn(24), _Stage(loop))
+    bar = Progress(
+        *columns,
+        TimeElapsedColumn(),
+        _TimeLeft(),
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    )
+    with bar:
+        total = loop.settings.rounds
+        begun = max(loop.round, 0)
+        bar.add_task("run", total=total, completed=begun, begun=begun, spent=sum(loop.learner.steps))
+        yield bar
+
+
+class _TimeLeft(ProgressColumn):
+    """Time left by the pace of the rounds so far."""
+
+    def render(self, task: Row) -> Text:
+        done = task.completed - task.fields["begun"]
+        if not done or not task.total or task.elapsed is None:
+            return Text("")
+        left = task.elapsed / done * (task.total - task.completed)
+        return Text(f"about {duration(left)} left", style="dim")
+
+
+def drive(running: Run) -> None:
+    """Run to the end, telling how it goes; on Ctrl-C say how to go on."""
+    with running:
+        for note in running.notes:
+            say(note, "yellow")
+        try:
+            with progress(running.loop, running.config.labeler.asks_people()) as bar, interrupts() as check:
+                for round in running:
+                    bar.update(bar.task_ids[0], completed=round.number)
+                    console.print(round_line(round), soft_wrap=True)
+                    for note in round.notes:
+                        say(f"  {note}", "yellow")
+                    check()
+        except KeyboardInterrupt:
+            say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
+            raise
+        console.print(summary_table(running.summary))
+        say(f"report: {running.report()}")
+        if not running.loop.reward.fitted:
+            raise ValueError(
+                "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
+            )
+
+
+@contextmanager
+def interrupts() -> Iterator[Callable[[], None]]:
+    """Gives a function that raises KeyboardInterrupt if Ctrl-C was pressed and came to nothing.
+
+    Python drops what is raised in a destructor or in a callback of a library, Ctrl-C too; it is then heard at the end
+    of a round. Only the main thread hears of signals; elsewhere nothing changes, nor where Ctrl-C is ignored, as it is
+    in what a shell script starts in the background.
+    """
+    pressed = False
+
+    def heard(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if pressed:
+            raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield check
+        return
+    signal.signal(signal.SIGINT, heard)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before or signal.default_int_handler)
+
+
+def say(text: str, style: str = "") -> None:
+    """One line as it is: names of files are no markup, and are not broken over lines."""
+    console.print(Text(text, style=style), soft_wrap=True)
+
+
+def round_line(round: Round[Any]) -> Text:
+    """One round in one line: what matters most first."""
+    m = round.metrics
+    parts = [
+        Text(f"round {round.number:>3}", style="bold"),
+        Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue"),
+        Text(f"learned {m['evaluate/learned']:>8.3g}" if "evaluate/learned" in m else " " * 16, style="yellow"),
+    ]
+    for key, label, form in (
+        ("fit/accuracy_held_out", "accuracy", ".2f"),
+        ("evaluate/kl", "kl", ".2f"),
+        ("evaluate/fluency", "fluency", ".2f"),
+        ("label/answered", "labels", ".0f"),
+        ("steps/learn", "steps", ",.0f"),
+    ):
+        if not math.isnan(m.get(key, math.nan)):
+            parts.append(Text(f"{label} {m[key]:z{form}}"))
+    seconds = sum(v for k, v in m.items() if k.startswith("seconds/"))
+    return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
+
+
+def summary_table(summary: Mapping[str, Any]) -> Table:
+    """`summary.json` for people."""
+    title = Text(f"{summary['task']} ({summary['kind']}), seed {summary['seed']}")
+    table = Table(title=title, show_header=False, box=None)
+    gold = f"{number(summary['gold_before'])} → {number(summary['gold_after'])} (best {number(summary['gold_best'])})"
+    table.add_row("gold", Text(gold, style="bold blue"))
+    table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
+    if (kind := find(summary["kind"])) and kind.drifts:
+        table.add_row("kl to the start, nats", number(summary["kl"]))
+        table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
+    for name in ("labels", "steps"):
+        table.add_row(name, ", ".join(f"{k} {v:,}" for k, v in summary[name].items()))
+    table.add_row("time", ", ".join(f"{k} {duration(v)}" for k, v in summary["seconds"].items()))
+    return table
+
+
+def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
+    """Names and numbers."""
+    return table(title, ("metric", "value"), [(name, number(value)) for name, value in metrics.items()])
+
+
+def card_table(card: ReportCard) -> Table:
+    """A reward model's report card: what it comes to, and every number."""
+    made = table(card_words.headline(card), ("", "value", "95 % interval, or why not"), ())
+    made.caption, made.caption_justify = Text(card_words.subject(card.about)), "left"
+    for name, rows in card_words.groups(card):
+        made.add_section()
+        made.add_row(Text(name, style="bold"))
+        for row in rows:
+            made.add_row(*(Text(cell) for cell in astuple(row)))
+    return made
+
+
+def table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
+    """A plain table; cells are text, never markup."""
+    made = Table(title=Text(title), title_justify="left")
+    for number_, column in enumerate(columns):
+        made.add_column(column, overflow="fold", no_wrap=number_ == 0)
+    for row in rows:
+        made.add_row(*(Text(cell) for cell in row))
+    return made
+
+
+def number(value: float | None) -> str:
+    return "—" if value is None else f"{value:.4g}"
+
+
+def duration(seconds: float) -> str:
+    """4.2 s, 3 min 05 s, 2 h 10 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -1,0 +1,82 @@
+"""The JSON Schema of a config file, for editors that complete and check YAML. Shipped as configs/schema.json."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+from prefrl.components import TABLE, Role, Settings, plugins, settings_class
+from prefrl.config import Config
+
+ROLES: dict[str, Role] = {
+    "task": "tasks",
+    "labeler": "labelers",
+    "select": "selectors",
+    "reward": "rewards",
+    "learner": "learners",
+}
+REQUIRED = ["task", "reward", "learner"]
+
+
+def schema() -> dict[str, Any]:
+    """Every key of a config with its type and meaning; for a component, the settings of each built-in kind."""
+    definitions: dict[str, Any] = {}
+    properties = {name: _group(name, field.annotation, definitions) for name, field in Config.model_fields.items()}
+    for name, field in Config.model_fields.items():
+        properties[name]["description"] = field.description
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "prefrl config",
+        "type": "object",
+        "properties": properties,
+        "required": REQUIRED,
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+
+
+def schema_of(cls: type[Settings]) -> dict[str, Any]:
+    """The schema of a settings class; with its defaults, a learner says what it optimises."""
+    made = cls.model_json_schema(ref_template="#/$defs/{model}")
+    if not made.get("required") and (formula := cls().formula()):
+        made["x-formula"] = formula
+    return made
+
+
+def described(role: Role, kind: str) -> dict[str, Any]:
+    """The schema of one kind's settings, with its `$defs`.
+
+    For a built-in kind it is taken from the file that is shipped: nothing is imported that the kind itself needs.
+    """
+    if kind in plugins(role):
+        return schema_of(settings_class(role, kind))
+    shipped = json.loads(files("prefrl.configs").joinpath("schema.json").read_text(encoding="utf-8"))
+    name = TABLE[role][kind].partition(":")[2]
+    return {**shipped["$defs"][name], "$defs": shipped["$defs"]}
+
+
+def _group(name: str, annotation: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    """The schema of one top-level key."""
+    if name in ROLES:
+        role = ROLES[name]
+        classes = {settings_class(role, kind): kind for kind in TABLE[role]}  # several kinds may share one
+        return {"oneOf": [_define(cls, definitions, kind) for cls, kind in classes.items()]}
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
+        return _define(annotation, definitions, None)
+    return {"type": "integer"}  # the seed
+
+
+def _define(cls: type[Settings], definitions: dict[str, Any], kind: str | None) -> dict[str, Any]:
+    """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
+    made = schema_of(cls)
+    definitions |= made.pop("$defs", {})
+    if kind is not None:
+        made["required"] = sorted({"kind", *made.get("required", [])})
+    definitions[cls.__name__] = made
+    return {"$ref": f"#/$defs/{cls.__name__}"}
+
+
+def text() -> str:
+    """The schema as it is shipped."""
+    return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"

@@ -1,0 +1,63 @@
+"""How a policy does: fresh behaviour, measured."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
+from prefrl.protocols import ControlTask, RewardModel
+from prefrl.sample.segments import segment
+from prefrl.types import Evaluation, Response, Segment
+
+if TYPE_CHECKING:  # a control learner loads no transformers
+    from prefrl.policies.language import LanguagePolicy
+
+EXAMPLES, EXAMPLE_SECONDS = 3, 4.0
+"""Openings of episodes to look at."""
+EXAMPLE_RESPONSES = 4
+
+
+def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
+    """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`; and openings to look at."""
+    lengths = rollout.ends.argmax(1) + 1  # (n,): argmax is the first end; what comes after it does not count
+    mask = np.arange(rollout.ends.shape[1]) < lengths[:, None]
+    gold = np.where(mask, rollout.gold, 0.0).sum(1)
+    learned = np.where(mask, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)
+    shown = max(1, round(EXAMPLE_SECONDS * task.fps))
+    examples = [
+        segment(rollout, i, 0, min(int(lengths[i]), shown), "evaluation") for i in range(min(EXAMPLES, len(gold)))
+    ]
+    metrics = {
+        "gold": float(gold.mean()),
+        "gold_std": float(gold.std()),
+        "learned": float(learned.mean()),
+        "length": float(lengths.mean()),
+    }
+    return Evaluation(metrics, tuple(examples))
+
+
+def responses(
+    policy: LanguagePolicy, prompts: int, reward: RewardModel[Response], rng: np.random.Generator
+) -> tuple[Evaluation[Response], int]:
+    """One response at temperature 1 to each of so many evaluation prompts, and how many tokens that took.
+
+    Metrics: gold, gold_std, learned, kl (nats per response: the mean log-ratio to the starting policy), length
+    (tokens), ended (share), and fluency where the task can tell.
+    """
+    task = policy.task
+    drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, temperature=1.0)
+    found = policy.with_gold(drawn)
+    gold = np.array([r.gold for r in found], float)
+    metrics = {
+        "gold": float(gold.mean()),
+        "gold_std": float(gold.std()),
+        "learned": float(reward.score(found).mean()),
+        "kl": float((drawn.logp - policy.start_logp(drawn, temperature=1.0)).sum(1).mean()),
+        "length": float(drawn.mask.sum(1).float().mean()),
+        "ended": float(drawn.ended.float().mean()),
+    }
+    fluent = task.fluency(found)
+    metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
+    return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count

@@ -1,0 +1,1 @@
+"""Files in and out: the forms in which judgements come and go."""

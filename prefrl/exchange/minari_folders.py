@@ -1,0 +1,79 @@
+"""Judged segments from a Minari data set with `labels.jsonl` beside it, as `exports.minari` writes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prefrl.exchange.layout import Parts, Row, answer_of
+from prefrl.exchange.reading import parse_json, read_lines, refuse_links
+from prefrl.types import Segment
+
+LABELS = "labels.jsonl"
+
+
+def is_minari(folder: Path) -> bool:
+    """Whether a folder is a Minari data set with labels."""
+    return (folder / "metadata.json").exists() and (folder / LABELS).exists()
+
+
+def minari_rows(folder: Path) -> Parts:
+    """(row N, what reads it) for each label. Raises `ValueError` where the data set is not one of ours."""
+    refuse_links(folder)
+    episodes = _Episodes(_storage(folder))
+    for number, line in enumerate(read_lines(folder / LABELS), 1):
+        yield f"{LABELS}, row {number}", partial(_parse, line, episodes)
+
+
+def _storage(folder: Path) -> Any:
+    """The data set's storage. Its own spaces must be in it: without them Minari would make the environment it names."""
+    try:
+        metadata = json.loads((folder / "metadata.json").read_text())
+    except ValueError as error:
+        raise ValueError(f"{folder / 'metadata.json'} is no JSON: {error}") from None
+    known = metadata if isinstance(metadata, dict) else {}
+    spaces = [known.get(name) for name in ("observation_space", "action_space")]
+    boxes = [json.loads(space) for space in spaces if isinstance(space, str)]
+    if [isinstance(box, dict) and box.get("type") for box in boxes] != ["Box", "Box"]:
+        raise ValueError(f"{folder}: expected a Minari data set whose observations and actions are each a Box")
+    from minari.dataset.minari_storage import MinariStorage
+
+    return MinariStorage.read(folder.absolute())
+
+
+@dataclass
+class _Episodes:
+    """The segments of a data set, each read once."""
+
+    storage: Any
+    found: dict[int, Segment] = field(default_factory=dict)
+
+    def __getitem__(self, number: Any) -> Segment:
+        total = self.storage.total_episodes
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < total:
+            raise ValueError(f"expected the number of an episode, from 0 to {total - 1}, got {number!r:.200}")
+        if number not in self.found:
+            (data,) = self.storage.get_episodes([number])
+            (meta,) = self.storage.get_episode_metadata([number])
+            self.found[number] = _segment(data, meta.get("options") or {})
+        return self.found[number]
+
+
+def _segment(data: Mapping[str, Any], options: Mapping[str, Any]) -> Segment:
+    observations, actions = (np.asarray(data[name], np.float32) for name in ("observations", "actions"))
+    if not np.isfinite(observations).all() or not np.isfinite(actions).all():
+        raise ValueError(f"episode {data['id']} holds values that are not finite")
+    return Segment(observations[:-1], actions, str(options.get("episode")), int(options.get("start", 0)))
+
+
+def _parse(line: str, episodes: _Episodes) -> Sequence[Row | str]:
+    row = parse_json(line)
+    if not isinstance(row, dict) or not isinstance(row.get("episodes"), list):
+        raise ValueError(f'expected "episodes": list, and an answer, got {line:.200}')
+    return [answer_of(row, [episodes[number] for number in row["episodes"]])]

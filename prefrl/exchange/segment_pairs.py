@@ -1,0 +1,91 @@
+"""Judged pairs of segments in an .npz, as Preference Transformer's data lies (Kim et al. 2023).
+
+For each part P ("train", "eval") arrays `P_obs_1`, `P_obs_2` (pairs, T, O), `P_action_1`, `P_action_2` (pairs, T, A),
+and for each labeler L `P_label_L` (pairs,): 0 where the first segment is better, 1 where the second is, 0.5 for a tie.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from prefrl.exchange.layout import Parts, Row
+from prefrl.judgements import Comparison
+from prefrl.types import Query, Segment
+
+ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
+
+
+def segment_pairs(path: Path) -> Parts:
+    """(part and row, what reads it) for each pair. Raises `ValueError` where arrays are missing or do not fit."""
+    try:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)  # a pickle can run any code
+            if not isinstance(archive, Mapping):
+                raise ValueError("expected an archive of arrays, got one array")
+            splits = [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
+            if not splits:
+                raise ValueError(f"expected arrays named train_obs_1 and so on, got {', '.join(archive) or 'none'}")
+            for split in splits:
+                arrays, labels = _arrays(archive, split)
+                for i in range(len(arrays["obs_1"])):
+                    yield f"{split}, row {i + 1}", partial(_rows, arrays, labels, split, i)
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _arrays(file: Mapping[str, Any], split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The segments of a part, and its labels by labeler."""
+    if missing := [f"{split}_{name}" for name in ARRAYS if f"{split}_{name}" not in file]:
+        raise ValueError(f"array {missing[0]} is missing")
+    prefix = f"{split}_label_"
+    arrays = {name: file[f"{split}_{name}"] for name in ARRAYS}
+    labels = {name.removeprefix(prefix): file[name] for name in file if name.startswith(prefix)}
+    if not labels:
+        raise ValueError(f"expected labels {prefix}human, say; there are none")
+    pairs, steps = arrays["obs_1"].shape[:2] if arrays["obs_1"].ndim == 3 else (-1, -1)
+    for name, array in arrays.items():
+        twin = arrays["obs_1" if name.startswith("obs") else "action_1"]
+        if array.ndim != 3 or array.shape != twin.shape or array.shape[:2] != (pairs, steps):
+            shapes = ", ".join(str(a.shape) for a in arrays.values())
+            raise ValueError(f"{split}_{name}: expected (pairs, T, O) twice and (pairs, T, A) twice, got {shapes}")
+        if array.dtype.kind != "f":
+            raise ValueError(f"{split}_{name}: expected floats (one-hot for discrete actions), got {array.dtype}")
+    for name, array in labels.items():
+        if array.shape != (pairs,) or array.dtype.kind not in "fiu":
+            got = f"{array.dtype} of shape {array.shape}"
+            raise ValueError(f"{prefix}{name}: expected a number for each of {pairs} pairs, got {got}")
+    return arrays, labels
+
+
+def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], split: str, i: int) -> list[Row | str]:
+    """One pair with every labeler's judgement on it."""
+    first, second = (_segment(arrays, split, side, i) for side in ("1", "2"))
+    query = Query((first, second))
+    swapped = query.candidates[0].id != first.id  # a query sorts its candidates by id
+    rows: list[Row | str] = []
+    for labeler, values in labels.items():
+        value = float(values[i])
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"label_{labeler}: expected 0 (first better) to 1 (second better), got {value}")
+        rows.append(Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split))
+    return rows
+
+
+def _segment(arrays: Mapping[str, np.ndarray], split: str, side: str, i: int) -> Segment:
+    """A segment that is called after its part and its content: the same one in two pairs is one candidate."""
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
+        observations, actions = (arrays[f"{name}_{side}"][i].astype(np.float32) for name in ("obs", "action"))
+    for name, values in ((f"obs_{side}", observations), (f"action_{side}", actions)):
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            raise ValueError(f"{name} is {values[tuple(bad[0])]} at step {bad[0][0] + 1}; expected finite float32")
+    content = hashlib.sha256(observations.tobytes() + actions.tobytes()).hexdigest()[:16]
+    return Segment(observations, actions, episode=f"{split}/{content}", start=0)

@@ -1,0 +1,233 @@
+"""The one update that every policy gradient here makes: gradient steps on a batch that was sampled before.
+
+Variant: PPO's surrogate (Schulman et al. 2017) or the plain policy gradient; a critic, an entropy bonus and a KL to a
+reference are terms beside it. Each term is averaged over the whole minibatch, however many parts it goes through the
+network in. It sees a policy and a batch, and nothing of the world that they come from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeAlias
+
+import torch
+from torch import Tensor
+
+from prefrl.improve.objectives import (
+    Reduction,
+    clipped_surrogate,
+    kl_k2,
+    kl_k3,
+    log_ratio,
+    masked_sum,
+    policy_gradient,
+    reduce,
+    value_loss,
+)
+from prefrl.protocols import I, Policy
+from prefrl.types import Metrics
+
+Parts: TypeAlias = Iterable[tuple[Tensor, dict[str, Tensor]]]
+"""A loss in parts that add up, each with what it measured: (loss, name -> number)."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a gradient step minimises; a weight of 0 leaves its term out."""
+
+    clip: float | None = None
+    """How far the ratio of new to old probability counts; None for the plain policy gradient."""
+    policy: bool = True
+    """False: the critic alone learns."""
+    value: float = 0.0
+    """Weight of the critic's loss."""
+    value_clip: float | None = None
+    """How far a value may move from the old one and still count as better."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    beta: float = 0.0
+    """Weight of the KL to the reference, as a loss."""
+    reduction: Reduction = "token"
+    """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
+    max_grad_norm: float = math.inf
+    """A gradient that is longer is shortened to this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch(Generic[I]):
+    """B sequences of at most L steps, and what a gradient step needs to know of each step."""
+
+    inputs: I
+    """What the policy reads; its mask (B, L) says which steps are real."""
+    logp: Tensor
+    """(B, L) log-probabilities under the policy that drew them."""
+    advantages: Tensor
+    """(B, L), or (B, 1) where all steps of a sequence have the same."""
+    returns: Tensor | None = None
+    """(B, L) the critic's targets."""
+    values: Tensor | None = None
+    """(B, L) what the critic said when they were drawn."""
+    reference: Tensor | None = None
+    """(B, L) log-probabilities under the reference policy."""
+
+    def __len__(self) -> int:
+        return len(self.logp)
+
+    def rows(self, at: Tensor) -> Batch[I]:
+        """Some sequences, cut to the longest of them."""
+        inputs = self.inputs.rows(at)
+        width = inputs.mask.shape[1]
+
+        def cut(steps: Tensor | None) -> Tensor | None:
+            return None if steps is None else steps[at, :width]
+
+        advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
+        return Batch(inputs, logp, advantages, cut(self.returns), cut(self.values), cut(self.reference))
+
+    def parts(self, size: int | None) -> Iterator[Batch[I]]:
+        """Parts of at most `size` sequences of like length, so that little padding is computed on; all at once for
+        None."""
+        if size is None:
+            yield self
+            return
+        # Stable: rows of equal length keep their order, so that the same seed rounds in the same way.
+        for at in self.inputs.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
+            yield self.rows(at)
+
+
+def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torch.optim.Adam:
+    """Adam with the eps of the PPO papers' code, which torch's default is a thousand times smaller than."""
+    return torch.optim.Adam(parameters, learning_rate, eps=1e-5, fused=True)
+
+
+def update(
+    policy: Policy[I],
+    optimizer: torch.optim.Optimizer,
+    batch: Batch[I],
+    minibatches: Iterable[Tensor],
+    objective: Objective,
+    part: int | None = None,
+) -> list[Metrics]:
+    """A gradient step on each minibatch, given as rows of the batch; what each step measured.
+
+    `part`: at most so many sequences go through the network at once; that changes memory, and results by rounding only.
+    Raises FloatingPointError where a loss or a gradient is not finite.
+    """
+    return [step(policy, optimizer, batch.rows(rows), objective, part) for rows in minibatches]
+
+
+def step(
+    policy: Policy[I], optimizer: torch.optim.Optimizer, batch: Batch[I], objective: Objective, part: int | None
+) -> Metrics:
+    """One gradient step.
+
+    Metrics, means over steps unless said: loss, grad_norm (before it is shortened), policy_loss (averaged as the
+    objective says), value_loss and entropy where there are any, clipped (the share of ratios beyond the clip), kl_old
+    (from the policy that drew the batch, estimator k3) and ratio_error (the largest |pi / pi_old - 1|).
+    """
+    mask = batch.inputs.mask
+    # Counts of the whole minibatch: a mean of the parts' means would give short parts too much weight.
+    rows, steps = len(mask), int(mask.sum())
+    parts = (_losses(policy, some, objective, rows, steps) for some in batch.parts(part))
+    return descend(policy.parameters(), optimizer, parts, objective.max_grad_norm)
+
+
+def descend(
+    parameters: Iterable[torch.nn.Parameter],
+    optimizer: torch.optim.Optimizer,
+    parts: Parts,
+    max_grad_norm: float,
+) -> Metrics:
+    """One gradient step on a loss that comes in parts.
+
+    Losses and measures add up over parts; `ratio_error` is the largest. Raises FloatingPointError, before anything
+    changes, where the loss or the gradient is not finite.
+    """
+    optimizer.zero_grad()
+    measured = []
+    for loss, seen in parts:
+        # One part's graph at a time is in memory; gradients add up in the parameters.
+        loss.backward()  # type: ignore[no-untyped-call]
+        names = ("loss", *seen)
+        # Detached, or the list would keep every part's graph alive.
+        measured.append(torch.stack([loss.detach(), *seen.values()]))
+    found = torch.stack(measured)
+    metrics = dict(zip(names, found.sum(0).tolist(), strict=True))
+    if "ratio_error" in metrics:
+        metrics["ratio_error"] = float(found[:, names.index("ratio_error")].max())
+    metrics["grad_norm"] = float(torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm))
+    for name in ("loss", "grad_norm"):
+        if not math.isfinite(metrics[name]):
+            raise FloatingPointError(
+                f"the {name} of a gradient step is {metrics[name]}; expected a finite number: look at the reward "
+                "model's scores, or lower learner.learning_rate"
+            )
+    optimizer.step()
+    return metrics
+
+
+def _losses(
+    policy: Policy[I], batch: Batch[I], objective: Objective, rows: int, steps: int
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of a part of a minibatch that has so many rows and steps, and the terms that it is made of."""
+    mask = batch.inputs.mask
+    if not objective.policy:
+        loss = _value(policy, batch, objective) / steps
+        return loss, {"value_loss": loss.detach()}
+    logp, entropies = policy.log_prob(batch.inputs)
+    ratios = log_ratio(logp, batch.logp, mask)
+    gain = _gain(logp, ratios, batch, objective)
+    loss = policy_loss = reduce(gain, mask, objective.reduction, rows, steps)
+    seen = {"policy_loss": policy_loss.detach()}
+    if objective.value:
+        value = _value(policy, batch, objective) / steps
+        loss, seen["value_loss"] = loss + objective.value * value, value.detach()
+    if entropies is not None:
+        entropy = masked_sum(entropies, mask) / steps
+        loss, seen["entropy"] = loss - objective.entropy * entropy, entropy.detach()
+    return loss, seen | _distances(ratios.detach(), objective, steps)
+
+
+def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -> Tensor:
+    """(B, L): what each step adds to the policy's loss, before averaging."""
+    if objective.clip is None:
+        gain = policy_gradient(logp, batch.advantages)
+    else:
+        gain = clipped_surrogate(ratios, batch.advantages, objective.clip)
+    if objective.beta:
+        assert batch.reference is not None
+        # Token by token: not the gradient of the whole sequence's KL, for it does not credit a token with what its
+        # choice does to the KL of later ones. The KL in the reward does.
+        gain = gain + objective.beta * kl_k2(logp, batch.reference)
+    return gain
+
+
+def _value(policy: Policy[I], batch: Batch[I], objective: Objective) -> Tensor:
+    """The critic's loss, summed over steps."""
+    assert batch.returns is not None
+    # Old values are read by the value clip alone.
+    values, old = policy.values(batch.inputs), batch.returns if batch.values is None else batch.values
+    return masked_sum(value_loss(values, old, batch.returns, objective.value_clip), batch.inputs.mask)
+
+
+def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Tensor]:
+    """How far the policy has gone from the one that drew the batch, from log-ratios that are 0 on padding."""
+    apart = ratios.expm1().abs()  # expm1 keeps the digits of ratios near 1
+    return {
+        "clipped": (apart > (objective.clip or math.inf)).sum() / steps,
+        # The old policy drew the samples, so this is KL(old || new): k3's d is log old - log new.
+        "kl_old": kl_k3(-ratios, ratios.new_zeros(())).sum() / steps,
+        "ratio_error": apart.max(),
+    }
+
+
+def steer(optimizer: torch.optim.Optimizer, kl: float, target: float, start: float) -> None:
+    """Move the learning rate by a factor of 1.5 towards a KL of `target`, as far as a hundredth of `start` or tenfold.
+
+    Nothing changes while the KL is within a factor of two of the target.
+    """
+    group = optimizer.param_groups[0]
+    factor = 1 / 1.5 if kl > 2 * target else 1.5 if kl < target / 2 else 1.0
+    group["lr"] = min(max(group["lr"] * factor, 0.01 * start), 10 * start)

@@ -1,0 +1,52 @@
+"""What the learners of text share: a language model that is sampled, evaluated, counted and saved."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+
+from prefrl.evaluate.policies import responses
+from prefrl.improve.gradient import adam
+from prefrl.policies.language import LanguagePolicy, Responses
+from prefrl.protocols import RewardModel, TextTask
+from prefrl.seeding import Device, device_of
+from prefrl.types import Evaluation, Response, State, Steps
+
+
+class Writer:
+    """A policy with its optimiser, and how many tokens it wrote for what."""
+
+    def __init__(self, task: TextTask, learning_rate: float, temperature: float, part: int, device: Device) -> None:
+        self.policy = LanguagePolicy(task, temperature, part)
+        self.policy.to(device_of(device))
+        self.optimizer = adam(self.policy.parameters(), learning_rate)
+        self.steps = Steps()
+
+    def ask(self, count: int, each: int, rng: np.random.Generator) -> list[Response]:
+        """At least `count` responses to be asked about, `each` to a random prompt, gold attached."""
+        drawn = self.policy.respond(self.policy.task.prompts(-(-count // each), rng), each, rng)
+        self.steps = self.steps.add(query=drawn.count)
+        return self.policy.with_gold(drawn)
+
+    def write(self, prompts: int, each: int, rng: np.random.Generator) -> Responses:
+        """A batch to learn from: `each` responses to every one of so many random prompts."""
+        drawn = self.policy.respond(self.policy.task.prompts(prompts, rng), each, rng)
+        self.steps = self.steps.add(learn=drawn.count)
+        return drawn
+
+    def evaluate(self, prompts: int, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
+        """One response at temperature 1 to each evaluation prompt; see `prefrl.evaluate.policies.responses`."""
+        evaluated, tokens = responses(self.policy, prompts, reward, rng)
+        self.steps = self.steps.add(evaluate=tokens)
+        return evaluated
+
+    def state(self) -> State:
+        optimizer = copy.deepcopy(self.optimizer.state_dict())  # its tensors are live, and the next step changes them
+        return {"model": self.policy.state(), "optimizer": optimizer, "steps": list(self.steps)}
+
+    def load(self, state: State) -> None:
+        """Raises ValueError where names or shapes differ."""
+        self.policy.load(state["model"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # which may keep the very tensors it is given
+        self.steps = Steps(*state["steps"])

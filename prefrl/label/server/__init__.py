@@ -1,1 +1,0 @@
-"""A page for people who label, and what stands behind it."""

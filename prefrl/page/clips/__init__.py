@@ -1,0 +1,1 @@
+"""Clips of segments: drawn by a supervised process, encoded, and kept."""

@@ -1,0 +1,1 @@
+"""What is improved: policies, how they act and how they write."""

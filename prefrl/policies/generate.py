@@ -1,0 +1,176 @@
+"""Sampling from a causal language model: our own decode loop, for any model of transformers and fast for Llamas.
+
+Prompts are padded on the left and run once for each group of samples; tokens are drawn by inverting the CDF; rows that
+have ended leave the batch. What comes back was drawn from the raw policy: no generation config has a say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from transformers import DynamicCache, PreTrainedModel
+
+from prefrl.policies.llama import LlamaDecoder
+
+KEEP_SHARE = 0.75
+"""Ended rows are dropped once this share or less of the rows goes on: moving the cache costs more than a few rows."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How responses are drawn."""
+
+    samples: int
+    """K responses to each prompt."""
+    max_tokens: int
+    """L: the most tokens of a response, the end token included."""
+    ends: tuple[int, ...]
+    """The tokens that end a response; none for a fixed length."""
+    temperature: float = 1.0
+
+
+@dataclass(frozen=True)
+class Generation:
+    """B = P x K responses, all of the first prompt first."""
+
+    tokens: Tensor
+    """(B, L) int64, right-padded with 0, the end token included where there is one."""
+    mask: Tensor
+    """(B, L) bool: the real tokens. Never worked out from the tokens: the padding may be a token like others."""
+    logp: Tensor
+    """(B, L) float32: log-probability of each token under the distribution it was drawn from; 0 on padding."""
+    ended: Tensor
+    """(B,) bool: whether an end token was drawn within L."""
+
+
+class Decoder(Protocol):
+    """One token more for each row of a batch."""
+
+    def step(self, tokens: Tensor) -> Tensor:
+        """(B,) the tokens just drawn -> (B, V) logits of the next ones."""
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with these rows only."""
+
+
+class CacheDecoder:
+    """Any causal model, through transformers' own cache."""
+
+    def __init__(self, model: PreTrainedModel, cache: DynamicCache, mask: Tensor, samples: int) -> None:
+        cache.batch_repeat_interleave(samples)
+        self._model, self._cache = model, cache
+        self._mask = mask.repeat_interleave(samples, 0)
+        self._positions = self._mask.sum(1, keepdim=True)  # (B, 1): where the first new token is, padding not counted
+
+    def step(self, tokens: Tensor) -> Tensor:
+        # For rows that have ended too: nobody reads what they go on to say.
+        self._mask = torch.cat([self._mask, torch.ones_like(self._mask[:, :1])], 1)
+        out = self._model(
+            input_ids=tokens[:, None],
+            attention_mask=self._mask,
+            position_ids=self._positions,
+            past_key_values=self._cache,
+            use_cache=True,
+        )
+        self._positions = self._positions + 1
+        logits: Tensor = out.logits[:, -1]  # (B, 1, V) -> (B, V)
+        return logits
+
+    def keep(self, rows: Tensor) -> None:
+        self._cache.batch_select_indices(rows)
+        self._mask, self._positions = self._mask[rows], self._positions[rows]
+
+
+@torch.no_grad()
+def generate(
+    model: PreTrainedModel,
+    prompts: Sequence[Sequence[int]],
+    sampling: Sampling,
+    generator: torch.Generator,
+    fast: bool = True,
+) -> Generation:
+    """Draw K responses to each of P prompts (token ids). Raises `ValueError` while the model is in training mode.
+
+    `fast` allows the decoder made for Llamas, which agrees with the general one to rounding.
+    """
+    if model.training:
+        raise ValueError("generation wants the model in eval mode: dropout would falsify its log-probabilities")
+    decoder, logits = _prefill(model, prompts, sampling, fast)
+    return _decode(decoder, logits, sampling, generator)
+
+
+def pad_left(prompts: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
+    """(P, T) token ids and (P, T) mask; padding is 0, which is a valid id. Raises `ValueError` for an empty prompt."""
+    if not prompts or not all(prompts):
+        raise ValueError("generation wants at least one prompt, and at least one token in each (the begin token)")
+    width = max(map(len, prompts))
+    # On the left, so that the last column is the last token of every prompt.
+    ids = torch.tensor([[0] * (width - len(p)) + list(p) for p in prompts])
+    mask = torch.tensor([[0] * (width - len(p)) + [1] * len(p) for p in prompts])
+    return ids, mask
+
+
+def _prefill(
+    model: PreTrainedModel, prompts: Sequence[Sequence[int]], sampling: Sampling, fast: bool
+) -> tuple[Decoder, Tensor]:
+    """Run each prompt once; (B, V) logits of the first tokens."""
+    ids, mask = pad_left(prompts)
+    ids, mask = ids.to(model.device), mask.to(model.device)
+    cache = DynamicCache(config=model.config)
+    # Padding is not counted: a model with absolute positions would otherwise see every prompt shifted.
+    positions = (mask.cumsum(1) - 1).clamp(min=0)
+    out = model(
+        input_ids=ids,
+        attention_mask=mask,
+        position_ids=positions,
+        past_key_values=cache,
+        use_cache=True,
+        logits_to_keep=1,
+    )
+    logits = out.logits[:, -1].repeat_interleave(sampling.samples, 0)  # (P, V) -> (B, V)
+    if fast and LlamaDecoder.fits(model):
+        return LlamaDecoder(model, cache, mask, sampling.samples, sampling.max_tokens), logits
+    return CacheDecoder(model, cache, mask, sampling.samples), logits
+
+
+def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: torch.Generator) -> Generation:
+    rows, length = len(logits), sampling.max_tokens
+    # All randomness is drawn first, a number for each place: what a row gets does not hang on when others end.
+    uniform = torch.rand(rows, length, generator=generator).to(logits.device)
+    ends = torch.tensor(sampling.ends, dtype=torch.int64, device=logits.device)
+    tokens = torch.zeros(rows, length, dtype=torch.int64, device=logits.device)
+    mask = torch.zeros(rows, length, dtype=torch.bool, device=logits.device)
+    logp = torch.zeros(rows, length, device=logits.device)
+    ended = torch.zeros(rows, dtype=torch.bool, device=logits.device)
+    live = torch.arange(rows, device=logits.device)
+    for t in range(length):
+        drawn, drawn_logp = draw(logits, uniform[live, t], sampling.temperature)
+        going = ~ended[live]  # ended rows that are still in the batch draw on, into padding
+        tokens[live, t], logp[live, t], mask[live, t] = drawn * going, drawn_logp * going, going
+        # Only after the mask was written: an end token is a real one.
+        ended[live] |= torch.isin(drawn, ends)
+        going = ~ended[live]
+        if t + 1 == length or not going.any():
+            break
+        if going.float().mean() <= KEEP_SHARE:
+            kept = going.nonzero()[:, 0]
+            decoder.keep(kept)
+            live, drawn = live[kept], drawn[kept]  # `kept` counts within the batch, `live` within the result
+        logits = decoder.step(drawn)
+    return Generation(tokens, mask, logp, ended)
+
+
+def draw(logits: Tensor, uniform: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+    """(B, V) logits and (B,) numbers in [0, 1) -> (B,) tokens, by inverting the CDF; (B,) their log-probabilities."""
+    # In float32: bfloat16 would lose two or three digits of every log-probability.
+    logp = (logits.float() / temperature).log_softmax(-1)
+    cdf = logp.exp().cumsum(-1)
+    total = cdf[:, -1:]
+    # Rounding must not reach the total itself: the last token would be taken even where its probability is 0.
+    target = torch.minimum(uniform[:, None] * total, torch.nextafter(total, torch.zeros_like(total)))
+    tokens = torch.searchsorted(cdf, target, right=True)
+    return tokens[:, 0], logp.gather(1, tokens)[:, 0]

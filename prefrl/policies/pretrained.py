@@ -1,0 +1,74 @@
+"""Models and tokenizers that others made, from a folder or by name: safetensors alone, and nobody's code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
+from transformers.utils.logging import (
+    disable_progress_bar,
+    enable_progress_bar,
+    get_verbosity,
+    is_progress_bar_enabled,
+    set_verbosity,
+    set_verbosity_error,
+)
+
+from prefrl.components import ConfigError
+
+
+def load_weights(auto: Any, name: str | Path, download: bool, switch: str = "") -> PreTrainedModel:
+    """A model of a transformers class, in float32, dropout off. Raises `ConfigError` where weights are missing.
+
+    `download`: whether a name may be looked up on the Hub; `switch`: the setting that allows it, for the advice.
+    """
+    where = {"local_files_only": not download, "trust_remote_code": False}
+    try:
+        with quiet():
+            model, info = auto.from_pretrained(
+                name, dtype=torch.float32, use_safetensors=True, output_loading_info=True, **where
+            )
+    except (OSError, ValueError) as error:
+        local = switch and not download
+        hint = f"only local files are looked at unless {switch} is true" if local else first_line(error)
+        raise ConfigError(f"no model in safetensors could be read from {str(name)!r}: {hint}") from error
+    headless = auto is AutoModel  # then nothing reads a pooler
+    # transformers fills what is missing with random numbers and only warns.
+    if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
+        raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
+    found: PreTrainedModel = model
+    return found
+
+
+def load_tokenizer(name: str | Path, download: bool) -> PreTrainedTokenizerBase:
+    """The tokenizer beside a model. Raises `ConfigError` where there is none."""
+    try:
+        found: PreTrainedTokenizerBase = AutoTokenizer.from_pretrained(
+            name, local_files_only=not download, trust_remote_code=False
+        )
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"no tokenizer could be read from {str(name)!r}: {first_line(error)}") from error
+    return found
+
+
+def first_line(error: Exception) -> str:
+    """What went wrong; the advice that libraries add is for others."""
+    return str(error).strip().partition("\n")[0]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep transformers from drawing bars, and from reporting on the head that is left out."""
+    shown, verbosity = is_progress_bar_enabled(), get_verbosity()
+    disable_progress_bar()  # type: ignore[no-untyped-call]
+    set_verbosity_error()  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        set_verbosity(verbosity)
+        if shown:
+            enable_progress_bar()  # type: ignore[no-untyped-call]

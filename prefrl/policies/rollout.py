@@ -1,0 +1,145 @@
+"""Rollouts: acting in n environments, and the learned reward of what happened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+
+from prefrl.components import ConfigError
+from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel
+from prefrl.types import Bools, Floats, Segment, State
+
+Act: TypeAlias = Callable[[Floats, Bools | None], tuple[Floats, Floats]]
+"""(n, O) observations, and (n, A) which discrete actions are legal or None where all are -> (n, A) what the policy
+chose, and (n, A) what the environment is to execute."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """T steps of n environments. A row may hold several episodes, one after another."""
+
+    observations: Floats
+    """(n, T, O) float32."""
+    choices: Floats
+    """(n, T, A) float32: what the policy drew."""
+    actions: Floats
+    """(n, T, A) float32: what was executed."""
+    final_observations: Floats
+    """(n, T, O) float32: what each step led to, before any reset."""
+    terminated: np.ndarray
+    """(n, T) bool."""
+    truncated: np.ndarray
+    """(n, T) bool."""
+    gold: Floats
+    """(n, T) float64. Hidden: for segments that an oracle is asked about, and for evaluation."""
+    states: Floats | None
+    """(n, T, S) float64 simulator states before each action."""
+    legal: Bools | None = None
+    """(n, T, A) which discrete actions there were; None where there always were all."""
+
+    @property
+    def ends(self) -> np.ndarray:
+        """(n, T) bool: the episode stopped here."""
+        ends: np.ndarray = self.terminated | self.truncated
+        return ends
+
+    @property
+    def begins(self) -> np.ndarray:
+        """(n, T) bool: the first step of an episode, or of the row."""
+        begins: np.ndarray = np.roll(self.ends, 1, 1)  # wraps the row's last end to its start, which is set below
+        begins[:, 0] = True
+        return begins
+
+    def state(self) -> State:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def joined(parts: Sequence[Rollout]) -> Rollout:
+    """Rollouts that follow one another, as one."""
+    arrays: dict[str, list[Any]] = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Rollout)}
+    whole: dict[str, Any] = {k: None if v[0] is None else np.concatenate(v, 1) for k, v in arrays.items()}
+    return Rollout(**whole)
+
+
+def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> tuple[Rollout, Floats]:
+    """Act for `steps` steps from `observations` (n, O); also returns the observations to go on from.
+
+    Raises FloatingPointError where an observation or an action is not finite.
+    """
+    rows = []
+    for t in range(steps):
+        # before the step: a segment shows the state in which each action was taken
+        states, legal = envs.states(), envs.legal()
+        choices, actions = act(observations, legal)
+        step = envs.step(actions)
+        # A copy: some simulators go on writing into the array that they gave out.
+        rows.append((observations, choices, actions, step, None if states is None else states.copy(), legal))
+        # The final ones: a reset in the same step would hide a simulation that went to infinity.
+        if not np.isfinite(step.final_observations).all():
+            raise FloatingPointError(_not_finite(step.final_observations, actions, t))
+        observations = step.observations
+    steps_ = [row[3] for row in rows]
+    rollout = Rollout(
+        observations=np.stack([row[0] for row in rows], 1),  # T x (n, O) -> (n, T, O)
+        choices=np.stack([row[1] for row in rows], 1),
+        actions=np.stack([row[2] for row in rows], 1),
+        final_observations=np.stack([s.final_observations for s in steps_], 1),
+        terminated=np.stack([s.terminated for s in steps_], 1),
+        truncated=np.stack([s.truncated for s in steps_], 1),
+        gold=np.stack([s.rewards for s in steps_], 1),
+        states=None if rows[0][4] is None else np.stack([cast(Floats, row[4]) for row in rows], 1),
+        legal=None if rows[0][5] is None else np.stack([cast(Bools, row[5]) for row in rows], 1),
+    )
+    return rollout, observations
+
+
+def learned_rewards(reward: StepRewardModel, rollout: Rollout) -> Floats:
+    """(n, T) learned rewards, scored in one batch. Raises FloatingPointError where one is not finite.
+
+    A reward that looks back sees no step of another episode, nor what came before this rollout.
+    """
+    rewards = reward.rewards(rollout.observations, rollout.actions, rollout.begins)
+    bad = np.argwhere(~np.isfinite(rewards))
+    if len(bad):
+        env, t = bad[0]
+        raise FloatingPointError(
+            f"the learned reward of environment {env}, step {t} of the rollout is {rewards[env, t]}; expected finite "
+            "rewards: look at the reward model's last fit"
+        )
+    return rewards
+
+
+def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Generator) -> Rollout:
+    """One episode in each of `episodes` fresh environments; a row may go on after its first end."""
+    envs = task.environments(episodes)
+    parts: list[Rollout] = []
+    observations, done = envs.reset(rng), np.zeros(episodes, bool)
+    # Blocks, so that it ends soon after the slowest environment; all episodes end at the horizon at the latest.
+    block = min(task.horizon, 100)
+    while not done.all():
+        steps = min(block, task.horizon - sum(p.ends.shape[1] for p in parts))
+        rollout, observations = collect(envs, observations, steps, act)
+        parts.append(rollout)
+        done |= rollout.ends.any(1)
+    return joined(parts)
+
+
+def step_rewards(reward: RewardModel[Segment]) -> StepRewardModel:
+    """A control learner needs a reward for each step, not for whole segments alone."""
+    if not isinstance(reward, StepRewardModel):
+        raise ConfigError(
+            f"a control learner needs a reward model with rewards(observations, actions), got {type(reward).__name__}; "
+            "use reward.kind=mlp"
+        )
+    return reward
+
+
+def _not_finite(observations: Floats, actions: Floats, t: int) -> str:
+    env = int(np.argwhere(~np.isfinite(observations))[0][0])
+    return (
+        f"the observation of environment {env} after step {t} of the rollout is not finite: {observations[env]}, after "
+        f"action {actions[env]}; the simulation diverged, or the environment is at fault"
+    )

@@ -1,0 +1,83 @@
+"""A few candidates kept for the report: texts as they are, clips as strips of frames."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from PIL import Image
+
+from prefrl.kinds import kind_of
+from prefrl.protocols import DrawnTask, Task
+from prefrl.storage.files import write_file
+from prefrl.types import Candidate, Floats, gold_score
+
+FRAMES = 6
+GAP, GREY = 2, 215
+"""Between two frames: pixels, and a shade that is seen on white pictures and on black ones."""
+HEIGHT = 160
+"""Pixels. Larger frames are made smaller, so that a report of many strips stays light."""
+
+
+def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | None, folder: Path, name: str) -> Path:
+    """Write `examples/<name>.json` into a run's folder, with a PNG strip for each clip, and return its path.
+
+    `learned` (N,) is the reward model's score of each example, None before there is a fitted one. Where frames
+    cannot be drawn (no graphics library, no simulator states) the caption says so.
+    """
+    if learned is not None and len(learned) != len(examples):
+        raise ValueError(f"expected one learned score for each of {len(examples)} examples, got {len(learned)}")
+    place, entries = folder / "examples", []
+    scores = [math.nan] * len(examples) if learned is None else [float(score) for score in learned]
+    for i, (candidate, score) in enumerate(zip(examples, scores, strict=True)):
+        gold = None if candidate.gold is None else _finite(gold_score(candidate))
+        shown = _show(task, candidate, place, f"{name}-{i}.png")
+        entries.append({"gold": gold, "learned": _finite(score), **shown})
+    path = place / f"{name}.json"
+    write_file(path, json.dumps(entries, indent=1, allow_nan=False).encode())
+    return path
+
+
+def strip(frames: np.ndarray, count: int = FRAMES) -> np.ndarray:
+    """Evenly spaced frames of (T, H, W, 3) uint8, the first and the last among them, side by side with thin gaps."""
+    at = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    gap = np.full((frames.shape[1], GAP, 3), GREY, np.uint8)
+    parts = [part for i in at for part in (gap, frames[i])][1:]
+    return np.concatenate(parts, axis=1)
+
+
+def _show(task: Task, candidate: Candidate, place: Path, file: str) -> dict[str, Any]:
+    kind = kind_of(candidate)
+    shown = kind.shown(kind.describe(candidate))
+    if shown.text is not None:
+        return {"prompt": shown.prompt, "text": shown.text}
+    drawn = cast(DrawnTask[Candidate], task)
+    try:
+        frames = drawn.frames(candidate)
+    except Exception as error:  # a renderer may raise anything, and a missing picture must not end a run
+        return {"caption": f"No picture: drawing failed with {type(error).__name__}: {error}"}
+    _save(strip(frames), place / file)
+    return {"strip": file, "caption": _caption(drawn, shown.steps)}
+
+
+def _caption(task: DrawnTask[Any], steps: int) -> str:
+    seconds = steps / task.fps
+    return f"{steps} steps, {seconds:.1f} s of simulated time, from left to right"
+
+
+def _save(picture: np.ndarray, path: Path) -> None:
+    image = Image.fromarray(picture)
+    if image.height > HEIGHT:
+        image = image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG", optimize=True)
+    write_file(path, buffer.getvalue())
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,103 @@
+"""The run in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from prefrl.evaluate.summary import STAGES
+from prefrl.kinds import RESPONSES, SEGMENTS, Kind, find
+from prefrl.report.records import Record, mapping, number, visible, whole
+
+
+@dataclass(frozen=True)
+class Facts:
+    """The run in numbers: from summary.json, or from the rounds so far. None is not known."""
+
+    task: str
+    kind: str
+    finished: bool
+    rounds: int
+    planned: int | None
+    seed: int | None
+    gold: tuple[float | None, float | None, float | None]
+    """Before, after, best."""
+    gold_spread: tuple[float | None, float | None]
+    """Standard deviation between episodes or responses, before and after."""
+    fluency: tuple[float | None, float | None]
+    reward_accuracy: float | None
+    kl: float | None
+    labels: Mapping[str, int | None]
+    steps: Mapping[str, int | None]
+    seconds: Mapping[str, float]
+    """By stage; only stages that were timed."""
+    total_seconds: float | None
+    versions: Mapping[str, str]
+
+    @property
+    def words(self) -> Kind[Any]:
+        """What people call things where candidates are of this kind; those of control where it is not known."""
+        return find(self.kind) or SEGMENTS
+
+
+def gather(record: Record) -> Facts:
+    """The run's facts: the summary's where it has them, else what the rounds say so far."""
+    summary, last = record.summary, record.last
+    gold, fluency = record.series("evaluate/gold"), record.series("evaluate/fluency")
+    spread = record.series("evaluate/gold_std")
+    known = [value for value in gold if value is not None]
+    seconds = _seconds(record)
+    rounds = whole(summary.get("rounds")) or max((whole(line["round"]) or 0 for line in record.rounds), default=0)
+
+    def total(name: str, keys: Sequence[str], stage: str) -> dict[str, int | None]:
+        of = mapping(summary.get(name))
+        return {key: whole(of[key]) if key in of else whole(last(f"{stage}/{key}")) for key in keys}
+
+    def first(key: str, fallback: float | None) -> float | None:
+        return number(summary[key]) if key in summary else fallback
+
+    return Facts(
+        task=visible(summary.get("task") or record.name, 200),
+        kind=visible(summary.get("kind") or (RESPONSES.name if any(v is not None for v in fluency) else ""), 20),
+        finished=bool(summary) and rounds >= (record.planned or 0),
+        rounds=rounds,
+        planned=record.planned,
+        seed=whole(summary.get("seed")),
+        gold=(
+            first("gold_before", gold[0] if gold else None),
+            first("gold_after", gold[-1] if gold else None),
+            first("gold_best", max(known, default=None)),
+        ),
+        gold_spread=(spread[0], spread[-1]) if spread else (None, None),
+        fluency=(
+            first("fluency_before", fluency[0] if fluency else None),
+            first("fluency_after", fluency[-1] if fluency else None),
+        ),
+        reward_accuracy=first("reward_accuracy", last("fit/accuracy_held_out")),
+        kl=first("kl", last("evaluate/kl")),
+        labels=total("labels", ("asked", "answered", "skipped"), "label"),
+        steps=total("steps", ("learn", "query", "evaluate"), "steps"),
+        seconds=seconds,
+        total_seconds=number(mapping(summary.get("seconds")).get("total")) or sum(seconds.values()) or None,
+        versions={visible(k, 100): visible(v, 200) for k, v in mapping(summary.get("versions")).items()},
+    )
+
+
+def _seconds(record: Record) -> dict[str, float]:
+    of = mapping(record.summary.get("seconds"))
+    found = {}
+    for stage in STAGES:
+        spent = sum(value or 0.0 for value in record.series(f"seconds/{stage}"))
+        found[stage] = max(number(of.get(stage)) or spent, 0.0)
+    return {stage: value for stage, value in found.items() if value}
+
+
+def calibration(record: Record) -> dict[str, float | None]:
+    """Brier score and calibration error as the fit of the held-out comparisons logged them."""
+    lines = [line for line in record.rounds if record.fitted_round in (None, whole(line["round"]))]
+    newest = lines[-1] if lines else {}
+    return {
+        "Brier score": number(newest.get("fit/brier_held_out")),
+        "calibration error": number(newest.get("fit/calibration_error_held_out")),
+    }

@@ -1,0 +1,80 @@
+"""The run in words, and its numbers as people read them."""
+
+from __future__ import annotations
+
+from prefrl.report.facts import Facts
+
+
+def headline(facts: Facts) -> str:
+    """What happened, in one plain sentence."""
+    spent = [
+        show_count(facts.labels["answered"], "label") if facts.labels["answered"] is not None else "",
+        show_count(sum(v or 0 for v in facts.steps.values()), facts.words.spent) if any(facts.steps.values()) else "",
+        show_time(facts.total_seconds) if facts.total_seconds else "",
+    ]
+    cost = ", ".join(word for word in spent if word)
+    took = f"{'in' if facts.finished else 'so far, in'} {show_count(facts.rounds, 'round')}" + (
+        f" ({cost})" if cost else ""
+    )
+    before, after, _ = facts.gold
+    if before is None or after is None:
+        return f"There is no gold to tell whether it helped, {took}." if facts.rounds else "No round is over yet."
+    start, end = show_number(before, after), show_number(after, before)
+    if start == end:
+        return f"Gold stayed at {end} {took}."
+    return f"Gold {'rose' if after > before else 'fell'} from {start} to {end} {took}."
+
+
+def verdict(facts: Facts) -> str:
+    """What to think of it: worse, within the spread, past its best, less fluent."""
+    before, after, best = facts.gold
+    remarks = []
+    if before is not None and after is not None:
+        spreads = [value for value in facts.gold_spread if value is not None]
+        if after < before:
+            remarks.append("The policy got worse.")
+        if after != before and spreads and abs(after - before) < min(spreads):
+            what = f"{facts.words.behaviour}s"
+            remarks.append(f"The change is smaller than one standard deviation between {what}.")
+        if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
+            remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
+    start, end = facts.fluency
+    if start is not None and end is not None:
+        if show_share(start) == show_share(end):
+            remarks.append(f"Fluency stayed at {show_share(end)}.")
+        else:
+            change = "fell" if end < start else "rose"
+            remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
+    return " ".join(remarks)
+
+
+def show_number(value: float | None, beside: float | None = None) -> str:
+    """Three or so significant digits, those of the larger one when beside another; a dash for what is not known."""
+    if value is None:
+        return "–"
+    size = max(abs(value), abs(beside or 0.0))
+    if size and (size < 0.001 or size >= 1e9):
+        return f"{value:.1e}".replace("-", "−")
+    digits = 0 if size >= 100 or not size else 1 if size >= 10 else 2 if size >= 0.1 else 3
+    return f"{value:,.{digits}f}".replace("-", "−")
+
+
+def show_share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f}\N{NO-BREAK SPACE}%".replace("-", "−")
+
+
+def show_time(seconds: float | None) -> str:
+    if seconds is None:
+        return "–"
+    if seconds < 0.95:
+        return f"{1000 * seconds:.0f} ms"
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def show_count(count: int | None, what: str = "") -> str:
+    shown = "–" if count is None else f"{count:,}"
+    return f"{shown} {what}{'' if count == 1 else 's'}" if what else shown

@@ -1,0 +1,104 @@
+"""Segments: where a rollout may be cut, and the first rollout of a starting policy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from prefrl.policies.rollout import Act, Rollout, collect, joined
+from prefrl.protocols import ControlTask
+from prefrl.types import Floats, Segment
+
+OVERLAP = 24
+"""How many segments of a first pool share a step, on average. A first pool is dense on purpose: docs/decisions.md."""
+PATIENCE = 4
+"""A first pool is given up after this many times the steps of as many segments that share none."""
+
+
+def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
+    """Where segments of `length` steps may start, as (W, 2) pairs (environment, step), and a weight (W,) for each.
+
+    A window lies inside one episode; the last start is included. The first and last window of an episode weigh as
+    much as `length` others: its edges would else be seen `length` times less often than its middle.
+    """
+    ends, begins = rollout.ends, rollout.begins
+    episode = begins.cumsum(1)  # (n, T): steps of one episode have one number
+    last = ends.shape[1] - length
+    if last < 0:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    inside = episode[:, : last + 1] == episode[:, length - 1 :]  # (n, last + 1)
+    starts = np.argwhere(inside)
+    env, t = starts.T
+    at_edge = begins[env, t] | ends[env, t + length - 1]
+    return starts, np.where(at_edge, float(length), 1.0)
+
+
+def cut(rollout: Rollout, length: int, count: int, name: str, rng: np.random.Generator) -> list[Segment]:
+    """`count` distinct segments of a rollout, oldest first, gold attached, drawn by the weights of `windows`."""
+    starts, weights = windows(rollout, length)
+    if len(starts) < count:
+        raise ValueError(
+            f"{rollout.ends.size} steps hold {len(starts)} segments of {length} steps within one episode, but {count} "
+            "were asked for; lower loop.pool or the segment length, or raise learner.steps_per_round"
+        )
+    chosen = rng.choice(len(starts), count, replace=False, p=weights / weights.sum())
+    # Oldest first, so that a selector can take the newest from the end.
+    by_time = starts[chosen][np.argsort(starts[chosen, 1], kind="stable")]
+    return [segment(rollout, int(env), int(t), length, name) for env, t in by_time]
+
+
+def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segment:
+    """Steps t ... t + length - 1 of one environment, by value; `name` makes its episode's name unique in a run."""
+    before = np.flatnonzero(rollout.ends[env, :t])
+    begin = int(before[-1]) + 1 if len(before) else 0
+    part = (env, slice(t, t + length))
+    return Segment(
+        # By value: a view would keep the whole rollout in memory for as long as the segment is.
+        observations=rollout.observations[part].copy(),
+        actions=rollout.actions[part].copy(),
+        episode=f"{name}/{env}/{begin}",
+        start=t - begin,
+        states=None if rollout.states is None else rollout.states[part].copy(),
+        gold=rollout.gold[part].copy(),
+    )
+
+
+def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.random.Generator) -> Rollout:
+    """What a starting policy does: `count` windows in count * segment_steps / OVERLAP steps, or in more.
+
+    It takes `horizon` steps at a time in each of at most `most` environments. Raises ValueError where episodes end too
+    early to hold that many windows.
+    """
+    episodes = max(1, math.ceil(count * task.segment_steps / (OVERLAP * task.horizon)))
+    # As many equal passes as it takes, over no more environments than are needed to fill them.
+    passes = math.ceil(episodes / most)
+    n = math.ceil(episodes / passes)
+    envs, parts, held, longest = task.environments(n), list[Rollout](), 0, 0
+    observations, age = envs.reset(rng), np.zeros(n, np.int64)
+    while len(parts) < passes or held < count:
+        if len(parts) >= PATIENCE * OVERLAP * passes:
+            raise ValueError(_too_short(task, sum(p.ends.size for p in parts), held, count, longest))
+        rollout, observations = collect(envs, observations, task.horizon, act)
+        parts.append(rollout)
+        ages = _ages(rollout.ends, age)
+        held += int((ages >= task.segment_steps).sum())  # so many windows end here
+        age, longest = np.where(rollout.ends[:, -1], 0, ages[:, -1]), max(longest, int(ages.max()))
+    return joined(parts)
+
+
+def _ages(ends: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(n, T): which step of its episode each is, from 1, where `before` (n,) steps came earlier."""
+    at = np.arange(ends.shape[1])
+    begins = np.where(np.roll(ends, 1, 1), at, -before[:, None])  # the roll wraps to column 0, set below
+    begins[:, 0] = -before
+    ages: np.ndarray = at + 1 - np.maximum.accumulate(begins, 1)
+    return ages
+
+
+def _too_short(task: ControlTask, steps: int, held: int, count: int, longest: int) -> str:
+    return (
+        f"{steps} steps of the starting policy hold {held} segments of {task.segment_steps} steps within one episode, "
+        f"but {count} were asked for; the longest episode seen had {longest} steps: make task.segment_seconds (or "
+        "segment_steps) smaller, or leave task.variable_horizon at false, so that episodes do not end early"
+    )

@@ -1,0 +1,1 @@
+"""Statistics: intervals, and agreement between raters."""

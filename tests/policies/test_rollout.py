@@ -1,0 +1,100 @@
+"""Rollouts: which segments are cut, what they carry, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from prefrl.envs.control import ControlSettings, GymnasiumTask
+from prefrl.evaluate.policies import evaluation
+from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, whole_episodes
+from prefrl.reward_models.mlp import MLPSettings
+from prefrl.reward_models.steps import StepReward
+from prefrl.types import Bools, Floats
+
+
+def _task(**settings: object) -> GymnasiumTask:
+    return ControlSettings.model_validate({"env": "Pendulum-v1", "horizon": 7, "segment_steps": 3, **settings}).build()
+
+
+def _act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+    actions = observations[:, :1] * 0.5
+    return actions, actions
+
+
+def _rollout(steps: int = 17, count: int = 2) -> Rollout:
+    envs = _task().environments(count)
+    return collect(envs, envs.reset(np.random.default_rng(0)), steps, _act)[0]
+
+
+def _model() -> StepReward:
+    return MLPSettings(hidden=(4,)).build(_task(), np.random.default_rng(0))
+
+
+def test_parts_joined_are_what_one_collection_would_have_been() -> None:
+    envs = _task().environments(2)
+    first, observations = collect(envs, envs.reset(np.random.default_rng(0)), 9, _act)
+    second, _ = collect(envs, observations, 8, _act)
+    whole = _rollout()
+    for name, values in joined([first, second]).state().items():
+        np.testing.assert_array_equal(values, whole.state()[name])
+
+
+def test_whole_episodes_spend_exactly_a_fixed_horizon() -> None:
+    task = _task(horizon=130, segment_steps=20)
+    rollout = whole_episodes(task, _act, 3, np.random.default_rng(0))
+    assert rollout.ends.shape == (3, 130)
+    found = evaluation(task, rollout, MLPSettings().build(task, np.random.default_rng(0)))
+    assert [len(s) for s in found.examples] == [80, 80, 80]
+    assert found.metrics["gold"] == pytest.approx(rollout.gold.sum(1).mean())
+
+
+def test_an_observation_that_is_not_finite_is_an_error_that_names_it_and_the_step() -> None:
+    class Broken:
+        def __init__(self) -> None:
+            self.inner, self.steps = _task().environments(2), 0
+
+        def reset(self, rng: np.random.Generator) -> Floats:
+            return self.inner.reset(rng)
+
+        def states(self) -> Floats | None:
+            return None
+
+        def legal(self) -> Bools | None:
+            return None
+
+        def step(self, actions: Floats):  # type: ignore[no-untyped-def]
+            self.steps += 1
+            step = self.inner.step(actions)
+            if self.steps == 3:
+                step.final_observations[1, 2] = np.nan
+            return step
+
+    envs = Broken()
+    with pytest.raises(FloatingPointError, match="observation of environment 1 after step 2"):
+        collect(envs, envs.reset(np.random.default_rng(0)), 5, _act)
+
+
+def test_a_reward_that_is_not_finite_is_an_error_that_names_it_and_the_step() -> None:
+    rollout = _rollout()
+    observations = rollout.observations.copy()
+    observations[1, 4] = np.inf
+    with pytest.raises(FloatingPointError, match="environment 1, step 4"):
+        evaluation(_task(), replace(rollout, observations=observations, truncated=rollout.truncated | True), _model())
+
+
+def test_a_reward_that_looks_back_is_told_where_episodes_begin() -> None:
+    rollout, told = _rollout(), list[Any]()
+
+    class Told:
+        fitted, members, memory = True, 1, 5
+
+        def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+            told.append(begins)
+            return np.zeros(observations.shape[:2], np.float32)
+
+    learned_rewards(Told(), rollout)  # type: ignore[arg-type]
+    assert np.flatnonzero(told[0][0]).tolist() == [0, 7, 14]
