@@ -13,7 +13,7 @@ SEED := $(shell od -An -N4 -tu4 /dev/urandom | tr -d ' ')
 endif
 export SEED
 
-.PHONY: demo test reading running lint types layers unit slow browser long docs cover budget nightly mutants peers clean
+.PHONY: demo test reading running tests lint types layers unit slow browser docs cover budget nightly mutants peers clean
 
 demo: .venv/demo
 	$(BIN)/prefrl run control/pendulum --out runs/pendulum
@@ -35,8 +35,14 @@ reading: .venv/dev
 	$(MAKE) --no-print-directory types
 
 running: .venv/dev
+	+.ci/in_memory --shared $(MAKE) --no-print-directory tests
+
+# One after another, whatever make is told: each takes all cores. Browsers need a run of their own: Playwright's event
+# loop lives in the main thread.
+tests: .venv/dev
 	$(MAKE) --no-print-directory unit
-	$(MAKE) --no-print-directory long
+	$(MAKE) --no-print-directory slow
+	$(MAKE) --no-print-directory browser
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -56,10 +62,6 @@ slow: .venv/dev
 
 browser: .venv/dev
 	$(PYTEST) -m browser
-
-# Both at once: they share a starting policy that takes minutes to make, and browsers wait most of the time.
-long: .venv/dev
-	$(PYTEST) -m "slow or browser"
 
 nightly: .venv/dev mutants
 	$(PYTEST) -m nightly

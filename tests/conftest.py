@@ -6,7 +6,6 @@ import math
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from itertools import product
@@ -55,14 +54,8 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _warm(request: pytest.FixtureRequest, _own_cache: None) -> None:
     """Where tests are held to a budget: what they all need is there, so that none pays for it by being the first."""
     if request.config.getoption("--budget"):
-        for name in (
-            "torch.utils.tensorboard",
-            "transformers.models.gpt2.modeling_gpt2",
-            "matplotlib.pyplot",
-            "mujoco",
-        ):
-            with suppress(ImportError):
-                import_module(name)
+        for name in ("torch.utils.tensorboard", "transformers.models.gpt2.modeling_gpt2", "matplotlib.pyplot"):
+            import_module(name)
         request.getfixturevalue("finished_tiny")
 
 

@@ -15,6 +15,7 @@ from filelock import FileLock
 from prefrl.config import Config
 from prefrl.rundir import Run
 
+SHARED = "PREFRL_TESTS_SHARED"
 TINY = {
     "control/toy": (
         "loop.rounds=3", "loop.labels=24", "learner.steps_per_round=400", "fitting.epochs=2",
@@ -38,9 +39,12 @@ def finish(config: Config, folder: Path) -> None:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder that the first process in need of it makes for all that run these tests. It is to be read alone."""
+    """A folder that the first process in need of it makes for all that run these tests. It is to be read alone.
+
+    `.ci/in_memory --shared` names a place for what several runs of pytest share, one after another.
+    """
     base = factory.getbasetemp()
-    root = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    root = Path(os.environ.get(SHARED) or (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base))
     folder = root / f"shared-{name}"
     with FileLock(root / f"shared-{name}.lock"):
         if not folder.exists():
