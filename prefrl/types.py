@@ -101,6 +101,10 @@ class Response:
     gold: Floats | None = None
     """(1,) the task's own score. Hidden, as in `Segment`."""
 
+    def __post_init__(self) -> None:
+        if "\0" in str(self.prompt):  # what stands between prompt and text in the id: two responses could share one
+            raise ValueError(f"a prompt may not hold a NUL character, got {self.prompt!r:.200}")
+
     @property
     def context(self) -> str:
         """Only responses to one prompt may be compared."""
