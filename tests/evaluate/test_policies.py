@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.evaluate.policies import evaluation
@@ -24,3 +25,12 @@ def test_evaluation_means_over_first_episodes_only() -> None:
     assert 8 <= metrics["length"] <= 11
     assert metrics["gold"] == metrics["length"]
     assert set(metrics) == {"gold", "gold_std", "learned", "length"}
+
+
+def test_an_evaluation_counts_the_last_step_of_an_episode() -> None:
+    task = _task()
+    act = lambda o, _: (o[:, :1],) * 2  # noqa: E731
+    rollout = whole_episodes(task, act, 3, np.random.default_rng(0))
+    metrics = evaluation(task, rollout, MLPSettings(hidden=(4,)).build(task, np.random.default_rng(0))).metrics
+    assert metrics["length"] == 7.0
+    assert metrics["gold"] == pytest.approx(rollout.gold.sum(1).mean())

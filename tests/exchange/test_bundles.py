@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from stores import fill, seal
 
-from prefrl.exchange.bundles import export_bundle, import_bundle
+from prefrl.exchange.bundles import export_bundle, import_bundle, try_bundle
 from prefrl.exchange.layout import Layout
 from prefrl.exchange.ports import import_judgements, try_import
 from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.storage import log
+from prefrl.storage.files import DamagedError
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Query, Response, Segment
@@ -44,6 +45,22 @@ def test_a_bundle_loses_nothing(
         assert copy.answers() == store.answers()
         assert [q.id for q in copy.open_queries()] == [q.id for q in store.open_queries()]
     assert not (tmp_path / "copy/gold").exists()
+
+
+def test_a_bundle_that_was_changed_after_it_was_written_is_refused(text_store: Store[Response], tmp_path: Path) -> None:
+    """By whoever turns an answer round, and leaves all else as it is."""
+    text_store.ask([query := texts("a", "b")])
+    text_store.answer([Comparison(query.id, 1.0, "me")])
+    export_bundle(text_store, tmp_path / "bundle")
+    events = tmp_path / "bundle/events.jsonl"
+    written = events.read_text()
+    events.write_text(written.replace('"preference": 1.0', '"preference": 0.0'))
+    assert events.read_text() != written
+    with Store[Response](tmp_path / "copy") as copy:
+        for read in (import_bundle, try_bundle):
+            with pytest.raises(DamagedError, match="it was changed"):
+                read(tmp_path / "bundle", copy)
+        assert copy.sequence == 0
 
 
 def test_a_bundle_never_takes_the_place_of_other_things(

@@ -147,6 +147,13 @@ def test_each_round_begins_by_scoring_what_is_replayed_anew(store: Store[Segment
     np.testing.assert_allclose(buffer.rewards[:80], 7.0 - buffer.observations[:80, :, 0], atol=1e-6)
 
 
+@both
+def test_an_evaluation_does_not_explore(algorithm: dict[str, Any]) -> None:
+    learner = _learner(point(), algorithm)
+    one, other = (learner.evaluate(Known(), np.random.default_rng(0)) for _ in range(2))
+    assert [s.id for s in one.examples] == [s.id for s in other.examples]
+
+
 def test_relabelling_sees_actions_as_they_were_executed() -> None:
     space = gymnasium.spaces.Box(np.array([-2.0], np.float32), np.array([6.0], np.float32))
     buffer = ReplayBuffer(6, gymnasium.spaces.Box(-1.0, 1.0, (1,)), space, n_envs=2)

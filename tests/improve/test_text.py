@@ -197,6 +197,24 @@ def test_the_reference_is_not_run_while_its_weight_is_zero(toy_reviews: Reviews)
         assert bool(runs) == (beta > 0)
 
 
+def test_a_kl_in_the_loss_leads_a_policy_back(toy_reviews: Reviews) -> None:
+    """Where all responses are worth the same, nothing else moves it."""
+    away = learner(toy_reviews, updates=6, beta=0.0, learning_rate=5e-3)
+    away.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    back = learner(toy_reviews, updates=6, kl_in="loss", missing_end_penalty=0.0, learning_rate=2e-3)
+    back.load(away.state() | {"optimizer": back.state()["optimizer"], "beta": 1.0})
+    equal = reward(constant=0.0)
+    before = back.evaluate(equal, np.random.default_rng(0)).metrics["kl"]
+    back.improve(equal, NO_STORE, np.random.default_rng(2))
+    assert back.evaluate(equal, np.random.default_rng(0)).metrics["kl"] < 0.8 * before
+
+
+def test_beta_goes_down_by_as_much_as_it_may_while_the_kl_is_far_below_its_target(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, updates=1, beta=0.3, kl_target=1000.0, kl_horizon=100.0)
+    one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    assert one.state()["beta"] == pytest.approx(0.3 * (1 - 0.2 * 16 / 100))  # after 4 x 4 responses
+
+
 def test_responses_without_an_end_are_penalised(toy_reviews: Reviews) -> None:
     """With nothing else to go by, ending is what is learned."""
     one = learner(toy_reviews, updates=10, prompts=8, learning_rate=5e-3, beta=0.0, missing_end_penalty=1.0)

@@ -73,7 +73,7 @@ def verdict(tree: Path, mutant: Mutant, seconds: float) -> str:
         return f"stale ({error})"
     finally:
         path.write_text(whole, "utf-8")
-    if status in (FAILED, TOO_LONG):
+    if status == FAILED or status < 0:  # a signal also says that it did not go well
         return "killed"
     return "survived" if status == 0 else f"stale (pytest ended with status {status}: were there such tests?)"
 

@@ -59,6 +59,16 @@ def test_logging_out_ends_this_session_and_no_other(service: Service) -> None:
     assert other.get("/api/me").status_code == 200
 
 
+def test_a_session_that_is_noted_after_its_person_was_sent_away_lets_nobody_in() -> None:
+    """Somebody logs in while an admin revokes them: the login comes second."""
+    access = Access()
+    access.note(access.invite("ann")[1])
+    token, session = access.session("ann")
+    access.note(access.change("ann", "revoked"))
+    access.note(session)
+    assert access.who(token, "session") is None
+
+
 def test_people_and_sessions_outlive_a_restart(store: Store[Segment]) -> None:
     with serving(store) as service:
         cookie = log_in(service, "ann").cookies[cookie_name(service)]

@@ -43,6 +43,17 @@ def test_parts_joined_are_what_one_collection_would_have_been() -> None:
         np.testing.assert_array_equal(values, whole.state()[name])
 
 
+def test_what_a_step_led_to_is_kept_also_where_an_episode_ended_there() -> None:
+    """Episodes of 7 steps, beside ones of 100 from the same start."""
+    rollout, envs = _rollout(), _task(horizon=100).environments(2)
+    longer, _ = collect(envs, envs.reset(np.random.default_rng(0)), 7, _act)
+    assert np.flatnonzero(rollout.ends.any(0)).tolist() == [6, 13]
+    assert np.array_equal(rollout.final_observations[:, :7], longer.final_observations)
+    goes_on = ~rollout.ends[:, :-1]
+    assert np.array_equal(rollout.final_observations[:, :-1][goes_on], rollout.observations[:, 1:][goes_on])
+    assert not np.isclose(rollout.final_observations[:, 6], rollout.observations[:, 7]).all(1).any()
+
+
 def test_whole_episodes_spend_exactly_a_fixed_horizon() -> None:
     task = _task(horizon=130, segment_steps=20)
     rollout = whole_episodes(task, _act, 3, np.random.default_rng(0))

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from prefrl.judgements import Comparison
+from prefrl.storage import engines
 from prefrl.storage.log import StoreError, StoreFull
 from prefrl.storage.maintenance import verify_store
 from prefrl.store import Store
@@ -58,6 +59,12 @@ def test_one_who_reads_for_long_delays_no_answer(text_store: Store[Response]) ->
     text_store.answer([Comparison(query.id, 1.0, "me")])
     assert time.monotonic() - begin < 15, "half of what a writer waits for a lock"
     reader.close()
+
+
+def test_whoever_writes_waits_for_the_disk(store: Store[Segment]) -> None:
+    with engines.writer(store.folder, None).connect() as connection:
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2  # FULL
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
 
 
 def test_the_log_cannot_be_changed(store: Store[Segment], make_query: Ask) -> None:

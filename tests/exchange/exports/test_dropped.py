@@ -153,6 +153,16 @@ def test_without_strengths_there_is_no_margin(text_store: Store[Response], tmp_p
     assert set(rows(tmp_path / "out.jsonl")[0]) == {"prompt", "chosen", "rejected"}
 
 
+@pytest.mark.parametrize("first_better", [0.0, 1.0])
+def test_the_better_one_is_the_chosen_one(text_store: Store[Response], tmp_path: Path, first_better: float) -> None:
+    text_store.ask([query := asked("a", "b")])
+    text_store.answer([Comparison(query.id, first_better)])
+    export(text_store, tmp_path / "out.jsonl")
+    better, worse = query.candidates if first_better else query.candidates[::-1]
+    (found,) = rows(tmp_path / "out.jsonl")
+    assert (found["chosen"], found["rejected"]) == (better.text, worse.text)
+
+
 def test_ties_can_be_written_both_ways(text_store: Store[Response], tmp_path: Path) -> None:
     text_store.ask([query := asked("a", "b")])
     text_store.answer([Comparison(query.id, 0.5)])
