@@ -101,10 +101,6 @@ class Response:
     gold: Floats | None = None
     """(1,) the task's own score. Hidden, as in `Segment`."""
 
-    def __post_init__(self) -> None:
-        if "\0" in str(self.prompt):  # what stands between prompt and text in the id: two responses could share one
-            raise ValueError(f"a prompt may not hold a NUL character, got {self.prompt!r:.200}")
-
     @property
     def context(self) -> str:
         """Only responses to one prompt may be compared."""
@@ -114,6 +110,8 @@ class Response:
     def id(self) -> str:
         """sha256 over prompt, text and tokens. The gold is not part of it."""
         tokens = {"prompt_tokens": np.array(self.prompt_tokens, np.int64), "tokens": np.array(self.tokens, np.int64)}
+        if "\0" in str(self.prompt):  # which also stands between prompt and text: say where the prompt ends
+            tokens["prompt_length"] = np.array(len(self.prompt))
         return digest(f"{self.prompt}\0{self.text}", tokens)
 
 

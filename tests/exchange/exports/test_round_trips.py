@@ -23,15 +23,13 @@ from prefrl.types import Query, Response, Segment
 TEXT = st.text(st.characters(blacklist_categories=["Cs"]), max_size=8) | st.sampled_from(
     ["=1+1", "@x", "'quoted", "", " ", "a,b", 'say "x"', "line\nbreak", "\r", "\x00", "\u2028", "[1]", "NA", "Human: x"]
 )
-PROMPT = TEXT.filter(lambda text: "\0" not in text)
-"""No response has another prompt: its id could be that of another one's."""
 PREFERENCE = st.sampled_from([0.0, 0.5, 1.0, 0.73, 0.12, 0.9500000001])
 LABELERS = ("ann", "bob", "=cmd", "zoë")
 SOME = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @st.composite
-def asked(draw: st.DrawFn, least: int = 1, most: int = 4, prompts: st.SearchStrategy[str] = PROMPT) -> Query[Response]:
+def asked(draw: st.DrawFn, least: int = 1, most: int = 4, prompts: st.SearchStrategy[str] = TEXT) -> Query[Response]:
     prompt = draw(prompts)
     texts = draw(st.lists(TEXT, min_size=least, max_size=most, unique=True))
     return Query(tuple(Response(prompt, text) for text in texts))
