@@ -44,16 +44,17 @@ def mean(
 ) -> Estimate:
     """The mean of hits (n,) in [0, 1]; those of one unit (n,) hang together, and are resampled together.
 
-    Wilson's interval where every hit is a unit of its own. Where all units have the same mean a bootstrap sees no
-    spread, and Wilson's over the number of units stands in.
+    Wilson's interval where every hit is 0 or 1 and a unit of its own: of fractions, which scatter less, it would be too
+    wide. Where all units have one mean a bootstrap sees no spread, and Wilson's over the number of units stands in.
     """
     if not len(hits):
         return undefined("no comparison of this sort")
     rows, sizes = patterns(np.column_stack([hits, np.ones(len(hits))]), unit)
     value, units = float(hits.mean()), int(sizes.sum())
-    if units == len(hits) or (units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0):
+    alone, alike = units == len(hits), units > 1 and np.ptp(rows[:, 0] / rows[:, 1]) == 0
+    if alike or (alone and np.isin(hits, (0.0, 1.0)).all()):
         low, high = wilson(value, units)
-        how = "Wilson" if units == len(hits) else f"Wilson over {units} {what}"
+        how = "Wilson" if alone else f"Wilson over {units} {what}"
         return Estimate(value=value, low=low, high=high, count=len(hits), how=how)
     sums = (weights @ rows for weights in draws(sizes, resamples, rng))
     found = defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Estimate(count=len(hits)), what)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from prefrl.stats.estimates import wilson
-from prefrl.stats.intervals import clusters, correlate, correlation, mean
+from prefrl.stats.estimates import Estimate, wilson
+from prefrl.stats.intervals import clusters, correlate, correlation, defined, mean
 
 
 def test_comparisons_that_share_a_candidate_hang_together() -> None:
@@ -66,6 +66,13 @@ def test_what_cannot_be_known_is_said_and_not_made_up(rng: np.random.Generator) 
     flat = correlation("spearman", np.ones(9), np.arange(9.0), range(9), rng)
     assert (flat.value, flat.why) == (None, "all values are equal")
     assert correlation("kendall", np.arange(2.0), np.arange(2.0), range(2), rng).why == "2 points"
+
+
+def test_an_interval_lies_around_the_value() -> None:
+    drawn = np.linspace(0.2, 0.4, 201)  # resamples of what is biased by 0.2
+    found = defined(np.array([0.5]), iter([drawn[:100], np.array([np.nan]), drawn[100:]]), 9, Estimate(count=12))
+    assert (found.low, found.high) == pytest.approx((0.405, 0.595))
+    assert (found.value, found.count, found.how) == (0.5, 12, "bootstrap over 9 clusters")
 
 
 def test_correlations_by_hand(rng: np.random.Generator) -> None:

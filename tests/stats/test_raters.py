@@ -248,6 +248,16 @@ def test_means_of_few_and_of_equal_things(rng: Generator) -> None:
     assert (flat.low, flat.high) == pytest.approx(proportion_confint(25, 50, method="wilson"))
 
 
+def test_more_raters_make_raw_agreement_surer(rng: Generator) -> None:
+    widths = []
+    for raters in (2, 12):
+        found = raw_agreement(ratings(noisy(rng, raters, 200)), rng)
+        assert found.low is not None
+        assert found.high is not None
+        widths.append(found.high - found.low)
+    assert widths[1] < 0.75 * widths[0]
+
+
 def test_the_position_test_is_exact_and_finds_a_bias_in_a_hundred_answers(rng: Generator) -> None:
     assert position_test(8, 10) == pytest.approx(2 * stats.binom.cdf(2, 10, 0.5))
     assert position_test(0, 0) is None
