@@ -235,6 +235,15 @@ def test_progress_counts_queries_however_many_people_answer(text_store: Store[Re
     assert text_store.progress() == (4, 1, 2)
 
 
+def test_nothing_is_learned_from_check_questions(text_store: Store[Response]) -> None:
+    (label, check) = responses(2)
+    text_store.ask([label])
+    text_store.ask([check], "check", [0])
+    text_store.answer([Comparison(query.id, 1.0, "ann") for query in (label, check)])
+    assert [one.query.id for one in text_store.judged()] == [label.id]
+    assert [one.query for one in text_store.answers()] == [label.id]
+
+
 def test_numbers_that_numpy_made_are_kept(folder: Path) -> None:
     query, pair = Query(tuple(Response("p", text) for text in "abc")), Query((Response("p", "a"), Response("p", "d")))
     ranks: Any = tuple(np.argsort([3, 1, 2]))

@@ -78,16 +78,19 @@ def verdict(tree: Path, mutant: Mutant, seconds: float) -> str:
     return "survived" if status == 0 else f"stale (pytest ended with status {status}: were there such tests?)"
 
 
-def run_tests(tree: Path, tests: Sequence[str], seconds: float) -> int:
-    """pytest's status, or TOO_LONG. No bytecode is kept: a mutant may have the size and the second of what it was."""
+def run_tests(tree: Path, tests: Sequence[str], seconds: float, output: int | None = subprocess.DEVNULL) -> int:
+    """pytest's status, or TOO_LONG; where `output` is None its words are shown.
+
+    No bytecode is kept: a mutant may have the size and the second of what it was.
+    """
     own = {"PYTHONPATH": f"{tree}", "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
     options = ["-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
     with subprocess.Popen(
         [sys.executable, "-m", "pytest", *options, *tests],
         cwd=tree,
         env=os.environ | own,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
         start_new_session=True,
     ) as started:
         try:
@@ -111,7 +114,7 @@ def main() -> int:
             tree = Path(made) / f"{number}"
             shutil.copytree(ROOT, tree, symlinks=True, ignore=LEFT_OUT)
             trees.put(tree)
-        if status := run_tests(tree, sorted({test for one in mutants for test in one.tests}), 3600.0):
+        if status := run_tests(tree, sorted({test for one in mutants for test in one.tests}), 3600.0, output=None):
             print(f"the tests fail on the whole product, or cannot be run: pytest ended with status {status}")
             return 1
 
