@@ -2,26 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from prefrl.evaluate.card import Bin
 from prefrl.stats.estimates import wilson
 from prefrl.types import Floats
-
-
-@dataclass(frozen=True)
-class Bin:
-    """Held-out comparisons of similar confidence."""
-
-    count: int
-    confidence: float
-    """Mean predicted probability of the favourite, in [0.5, 1]."""
-    share: float
-    """How often the favourite was preferred; a tie counts half."""
-    low: float
-    high: float
-    """The 95 % Wilson interval of the share."""
 
 
 def reliability(predicted: Floats, preference: Floats, bins: int = 5) -> tuple[Bin, ...]:
@@ -42,4 +27,4 @@ def reliability(predicted: Floats, preference: Floats, bins: int = 5) -> tuple[B
 def _bin(confidence: Floats, won: Floats) -> Bin:
     share = float(won.mean())
     low, high = wilson(share, len(won))
-    return Bin(len(won), float(confidence.mean()), share, low, high)
+    return Bin(count=len(won), confidence=float(confidence.mean()), share=share, low=low, high=high)

@@ -21,14 +21,17 @@ class Bucket(Part):
     """How often the longer one was preferred, where lengths were looked at."""
 
 
-class ReliabilityBin(Part):
-    """Comparisons of similar confidence; see `calibration.Bin`."""
+class Bin(Part):
+    """Held-out comparisons of similar confidence."""
 
     count: int
     confidence: Number
+    """Mean predicted probability of the favourite, in [0.5, 1]."""
     share: Number
+    """How often the favourite was preferred; a tie counts half."""
     low: Number
     high: Number
+    """The 95 % Wilson interval of the share."""
 
 
 class About(Part):
@@ -73,7 +76,7 @@ class Calibration(Part):
     brier: Estimate
     error: Estimate
     """Expected calibration error."""
-    bins: list[ReliabilityBin]
+    bins: list[Bin]
     temperatures: Annotated[list[Number], Field(max_length=2)]
     """Fitted on one half, and on the other; empty where `log_loss_after` says why."""
     log_loss_after: Estimate

@@ -12,7 +12,7 @@ import numpy as np
 
 from prefrl.evaluate.agreement import Pairs, against_gold, buckets, labeler_part, member_part
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import About, Calibration, Gold, ReliabilityBin, ReportCard, Scatter
+from prefrl.evaluate.card import About, Calibration, Gold, ReportCard, Scatter
 from prefrl.evaluate.distances import distance_part
 from prefrl.evaluate.drift import drift, read_probes
 from prefrl.evaluate.invariance import self_test
@@ -234,7 +234,7 @@ def _calibration(pairs: Pairs, answering: Answering, rng: np.random.Generator) -
         log_loss=_measured(log_losses(pairs.logits, y, answering).mean(), y),
         brier=_measured(brier(p, y), y),
         error=_measured(calibration_error(p, y), y),
-        bins=[ReliabilityBin(**vars(b)) for b in reliability(p, y)],
+        bins=list(reliability(p, y)),
         temperatures=found,
         log_loss_after=_measured(log_losses(cooled, y, answering).mean(), y) if found else too_few,
         error_after=_measured(calibration_error(answering.expected(cooled), y), y) if found else too_few,

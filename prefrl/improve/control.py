@@ -17,13 +17,12 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings, filled_in
-from prefrl.evaluate.policies import evaluation
 from prefrl.improve.gradient import Batch, Objective, adam, steer, update
 from prefrl.improve.objectives import gae, masked_whiten
+from prefrl.improve.player import Player
 from prefrl.policies.mlp import Decisions, MLPPolicy
-from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards, whole_episodes
+from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
-from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
@@ -138,24 +137,18 @@ class ControlLearner:
 
     def __init__(self, settings: ControlLearnerSettings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
+        self._player = Player(task, settings.environments)
         self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
         self.policy.to(device_of(settings.device))
         self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
-        self._steps, self._rounds = Steps(), 0
-        self._recent: Rollout | None = None
 
     @property
     def steps(self) -> Steps:
-        return self._steps
+        return self._player.steps
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of the last round's rollouts; before the first round, of the starting policy (query steps)."""
-        rollout = self._recent
-        if rollout is None:
-            most = self._settings.environments
-            rollout = first_rollout(self._task, self._act(rng), count, most, rng)
-            self._steps = self._steps.add(query=rollout.ends.size)
-        return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
+        return self._player.sample(count, self._act(rng), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """`steps_per_round` environment steps of learning, from fresh episodes; metrics are means over rollouts.
@@ -168,37 +161,24 @@ class ControlLearner:
         observations = envs.reset(rng)
         for number, steps in enumerate(self._rollout_lengths()):
             rollout, observations = collect(envs, observations, steps, self._act(rng))
-            self._steps = self._steps.add(learn=rollout.ends.size)
             # Only before the first rollout is the reward one that the critic has not seen.
             metrics.append(self._learn(rollout, scorer, rng, critic_first=number == 0))
             rollouts.append(rollout)
         # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
-        self._recent, self._rounds = joined(rollouts), self._rounds + 1
+        self._player.learned_from(joined(rollouts))
         return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
-        episodes = self._settings.evaluation_episodes
-        rollout = whole_episodes(self._task, self._act(None), episodes, rng)
-        self._steps = self._steps.add(evaluate=rollout.ends.size)
-        return evaluation(self._task, rollout, reward)
+        return self._player.evaluate(self._settings.evaluation_episodes, self._act(None), reward, rng)
 
     def state(self) -> State:
-        recent = None if self._recent is None else self._recent.state()
-        policy, optimizer = self.policy.state(), self._optimizer.state_dict()
-        return {
-            "policy": policy,
-            "optimizer": optimizer,
-            "recent": recent,
-            "steps": list(self._steps),
-            "rounds": self._rounds,
-        }
+        return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()} | self._player.state()
 
     def load(self, state: State) -> None:
         self.policy.load(state["policy"])
         self._optimizer.load_state_dict(state["optimizer"])
-        self._recent = None if state["recent"] is None else Rollout(**state["recent"])
-        self._steps, self._rounds = Steps(*state["steps"]), state["rounds"]
+        self._player.load(state)
 
     def _rollout_lengths(self) -> list[int]:
         each = self._settings.steps_per_round // self._settings.environments

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, Literal
 
 import numpy as np
@@ -19,11 +19,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings
-from prefrl.evaluate.policies import evaluation
+from prefrl.improve.player import Player
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
-from prefrl.policies.rollout import Rollout, step_rewards, whole_episodes
+from prefrl.policies.rollout import Act, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
-from prefrl.sample.segments import cut, first_rollout
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
@@ -110,32 +109,27 @@ class SB3:
     """
 
     def __init__(self, settings: SB3Settings, task: ControlTask, rng: np.random.Generator) -> None:
-        self._settings, self._task = settings, task
+        self._settings = settings
+        self._player = Player(task, settings.environments)
         self._env = TaskEnv(task, settings.environments)
         self._learned = LearnedReward(self._env, None)
         with seeded(rng):
             self.model = _algorithm(settings, self._learned)
         _check_steps(settings)
-        self._steps, self._rounds = Steps(), 0
-        self._recent: Rollout | None = None
 
     @property
     def steps(self) -> Steps:
-        return self._steps
+        return self._player.steps
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of the last round; before the first round, of the starting policy (query steps)."""
-        rollout = self._recent
-        if rollout is None:
-            with seeded(rng):
-                act, most = self._act(deterministic=False), self._settings.environments
-                rollout = first_rollout(self._task, act, count, most, rng)
-            self._steps = self._steps.add(query=rollout.ends.size)
-        return cut(rollout, self._task.segment_steps, count, f"round {self._rounds}", rng)
+        # Only the first round acts here; later ones cut what was done already.
+        with nullcontext() if self._player.rounds else seeded(rng):
+            return self._player.sample(count, self._act(deterministic=False), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
-        self._learned.learned, before = step_rewards(reward), self._env.steps
+        self._learned.learned = step_rewards(reward)
         # Before learning: the buffer holds what the reward model said before its last fit.
         if isinstance(self.model, SAC):
             relabel(self.model.replay_buffer, step_rewards(reward))
@@ -144,19 +138,16 @@ class SB3:
         with seeded(rng):
             self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
             self.model.learn(self._settings.steps_per_round, reset_num_timesteps=False, log_interval=None)
-        self._steps = self._steps.add(learn=self._env.steps - before)
         # Taken before the second start, which forgets it and so frees the memory.
-        self._recent, self._rounds = self._env.rollout(), self._rounds + 1
+        self._player.learned_from(self._env.rollout())
         self._env.start(rng)
         values = self.model.logger.name_to_value
         return {k.removeprefix("train/"): float(v) for k, v in values.items() if k.startswith("train/")}
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
-        episodes = self._settings.evaluation_episodes
-        rollout = whole_episodes(self._task, self._act(deterministic=True), episodes, rng)
-        self._steps = self._steps.add(evaluate=rollout.ends.size)
-        return evaluation(self._task, rollout, reward)
+        act = self._act(deterministic=True)
+        return self._player.evaluate(self._settings.evaluation_episodes, act, reward, rng)
 
     def state(self) -> State:
         names, variables = self.model._get_torch_save_params()
@@ -166,10 +157,7 @@ class SB3:
             "variables": {name: getattr(self.model, name).detach().clone() for name in variables},
             "counters": counters,
             "replay": _replay_state(self.model.replay_buffer) if isinstance(self.model, SAC) else None,
-            "recent": None if self._recent is None else self._recent.state(),
-            "steps": list(self._steps),
-            "rounds": self._rounds,
-        }
+        } | self._player.state()
 
     def load(self, state: State) -> None:
         for name, values in state["modules"].items():
@@ -180,10 +168,9 @@ class SB3:
             setattr(self.model, name, value)
         if isinstance(self.model, SAC):
             _load_replay(self.model.replay_buffer, state["replay"])
-        self._recent = None if state["recent"] is None else Rollout(**state["recent"])
-        self._steps, self._rounds = Steps(*state["steps"]), state["rounds"]
+        self._player.load(state)
 
-    def _act(self, deterministic: bool) -> Any:
+    def _act(self, deterministic: bool) -> Act:
         def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
             chosen, _ = self.model.predict(observations, deterministic=deterministic)
             actions = executed(self._env.action_space, chosen)

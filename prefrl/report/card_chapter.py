@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from prefrl.evaluate.calibration import Bin
 from prefrl.evaluate.card import Bucket, ReportCard
 from prefrl.report import card_words, plots
 from prefrl.report.card_words import Row
@@ -63,7 +62,6 @@ def _between(e: Estimate, percent: bool) -> str:
 
 
 def _agreement(card: ReportCard) -> tuple[Card, ...]:
-    bins = [Bin(**b.model_dump()) for b in card.calibration.bins]
     return (
         Card(
             "Accuracy by margin",
@@ -73,7 +71,7 @@ def _agreement(card: ReportCard) -> tuple[Card, ...]:
         ),
         Card(
             "Is it as sure as it may be?",
-            plots.reliability("card-reliability", bins),
+            plots.reliability("card-reliability", card.calibration.bins),
             "Of comparisons that the model is so sure about, the share in which it was right; below the dashes it is "
             "too sure. Bars and numbers count the comparisons.",
         ),

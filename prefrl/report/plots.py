@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from prefrl.evaluate.calibration import Bin
+from prefrl.evaluate.card import Bin
 from prefrl.evaluate.summary import STAGES
 
 Series: TypeAlias = Sequence[float | None]

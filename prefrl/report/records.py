@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from prefrl.evaluate.calibration import Bin, reliability
-from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.calibration import reliability
+from prefrl.evaluate.card import Bin, ReportCard
 from prefrl.types import Json
 
 Json: TypeAlias = Json

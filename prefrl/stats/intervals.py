@@ -6,6 +6,7 @@ that are alike is drawing how often each pattern comes up: that keeps large tabl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
@@ -57,12 +58,18 @@ def mean(
         how = "Wilson" if alone else f"Wilson over {units} {what}"
         return Estimate(value=value, low=low, high=high, count=len(hits), how=how)
     sums = (weights @ rows for weights in draws(sizes, resamples, rng))
-    found = defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Estimate(count=len(hits)), what)
-    return found if found.low is None else found.model_copy(update={"low": max(found.low, 0.0)})
+    return defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Estimate(count=len(hits)), what, 0.0)
 
 
-def defined(value: Floats, drawn: Iterator[Floats], units: int, found: Estimate, what: str = "clusters") -> Estimate:
-    """`found` with a value (1,) at most 1, and the percentiles of what was drawn; as it is where the value is NaN.
+def defined(
+    value: Floats,
+    drawn: Iterator[Floats],
+    units: int,
+    found: Estimate,
+    what: str = "clusters",
+    least: float = -math.inf,
+) -> Estimate:
+    """`found` with a value (1,) in [least, 1], and the percentiles of what was drawn; as it is where that is NaN.
 
     The percentiles are shifted by the resamples' bias, so that they lie around the value.
     """
@@ -76,7 +83,7 @@ def defined(value: Floats, drawn: Iterator[Floats], units: int, found: Estimate,
     if not len(rows) or np.ptp(rows) < 1e-12:
         return found.model_copy(update={"how": "no interval: resampling shows no spread"})
     low, high = np.percentile(rows, (2.5, 97.5)) + value[0] - rows.mean()
-    said = {"low": float(low), "high": min(float(high), 1.0), "how": f"bootstrap over {units} {what}"}
+    said = {"low": max(float(low), least), "high": min(float(high), 1.0), "how": f"bootstrap over {units} {what}"}
     return found.model_copy(update=said)
 
 
@@ -148,16 +155,14 @@ def correlation(
         return undefined(f"{len(x)} points" if len(x) < 3 else "all values are equal")
     at = np.unique(np.array([str(c) for c in cluster]), return_inverse=True)[1]
     members = np.split(np.argsort(at, kind="stable"), np.cumsum(np.bincount(at))[:-1])
-    if len(members) < FEW:
-        return Estimate(value=value, count=len(x), how=f"no interval: only {len(members)} clusters")
-    found = []
-    for _ in range(CORRELATION_RESAMPLES):
-        rows = np.concatenate([members[i] for i in rng.integers(len(members), size=len(members))])
-        found.append(correlate(kind, x[rows], y[rows]))
-    low, high = np.percentile([f for f in found if f is not None] or [np.nan], (2.5, 97.5))
-    if not np.isfinite(low):
-        return Estimate(value=value, count=len(x), how="no interval: resamples are constant")
-    return Estimate(value=value, low=low, high=high, count=len(x), how=f"bootstrap over {len(members)} clusters")
+
+    def drawn() -> Iterator[Floats]:
+        for _ in range(CORRELATION_RESAMPLES):
+            rows = np.concatenate([members[i] for i in rng.integers(len(members), size=len(members))])
+            found = correlate(kind, x[rows], y[rows])
+            yield np.array([np.nan if found is None else found])  # a resample can be constant
+
+    return defined(np.array([value]), drawn(), len(members), Estimate(count=len(x)), least=-1.0)
 
 
 def correlate(kind: Literal["spearman", "pearson", "kendall"], x: Floats, y: Floats) -> float | None:

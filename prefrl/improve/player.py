@@ -1,0 +1,50 @@
+"""What the learners of control share: behaviour that is cut into segments, evaluated, counted and saved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from prefrl.evaluate.policies import evaluation
+from prefrl.policies.rollout import Act, Rollout, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel
+from prefrl.sample.segments import cut, first_rollout
+from prefrl.types import Evaluation, Segment, State, Steps
+
+
+class Player:
+    """The last round's rollout, and how many steps were taken for what. `most` environments are stepped at once."""
+
+    def __init__(self, task: ControlTask, most: int) -> None:
+        self._task, self._most = task, most
+        self._recent: Rollout | None = None
+        self.rounds = 0
+        self.steps = Steps()
+
+    def sample(self, count: int, act: Act, rng: np.random.Generator) -> list[Segment]:
+        """Segments of the last round's rollout; before the first round, of the starting policy (query steps)."""
+        rollout = self._recent
+        if rollout is None:
+            rollout = first_rollout(self._task, act, count, self._most, rng)
+            self.steps = self.steps.add(query=rollout.ends.size)
+        return cut(rollout, self._task.segment_steps, count, f"round {self.rounds}", rng)
+
+    def learned_from(self, rollout: Rollout) -> None:
+        """A round is over, in which this was done."""
+        self._recent, self.rounds = rollout, self.rounds + 1
+        self.steps = self.steps.add(learn=rollout.ends.size)
+
+    def evaluate(
+        self, episodes: int, act: Act, reward: RewardModel[Segment], rng: np.random.Generator
+    ) -> Evaluation[Segment]:
+        """So many episodes, each in a fresh environment."""
+        rollout = whole_episodes(self._task, act, episodes, rng)
+        self.steps = self.steps.add(evaluate=rollout.ends.size)
+        return evaluation(self._task, rollout, reward)
+
+    def state(self) -> State:
+        recent = None if self._recent is None else self._recent.state()
+        return {"recent": recent, "steps": list(self.steps), "rounds": self.rounds}
+
+    def load(self, state: State) -> None:
+        self._recent = None if state["recent"] is None else Rollout(**state["recent"])
+        self.steps, self.rounds = Steps(*state["steps"]), state["rounds"]
