@@ -1,4 +1,9 @@
-"""A reward that is linear in features of a step, with the posterior of its weights in closed form."""
+"""A reward that is linear in features of a step, with the posterior of its weights in closed form.
+
+Variant: the Bayesian linear reward of Sadigh et al. 2017 with a Gaussian prior and Laplace's approximation (MacKay
+2003, chapter 27), where the paper has a prior on the unit ball and Metropolis samples. The members are draws whose
+noise is fixed when the model is built. Left out: a prior that is learned.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Rewards that look back: a GRU, and a causal transformer over steps. A step is judged by what led to it."""
+"""Rewards that look back: a GRU, and a causal transformer over steps. A step is judged by what led to it.
+
+Variants: the GRU of Cho et al. 2014 with the reset gate after the product; and the Preference Transformer (Kim et al.
+2023, section 4) with one token a step and preference attention that looks back only, so that each step has a reward of
+its own. Left out: attention to later steps, and dropout.
+"""
 
 from __future__ import annotations
 

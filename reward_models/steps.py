@@ -1,5 +1,8 @@
 """What every reward model for control shares: a network says something of each step, and a segment's score is the sum.
 
+Variant: Christiano et al. 2017, section 2.2.3. Sums have no discount; each member is normalised over the steps of a
+fit, and members are put together step by step. Left out: weights of single steps.
+
 A network is small: it maps normalised steps to outputs, E members at once. All else is here.
 """
 
