@@ -47,7 +47,8 @@ class LinearSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
-        found, describe = control(task, f"reward kind {self.kind!r} scores control segments"), self._hand_made()
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
+        describe = self._hand_made()
         network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 
@@ -75,7 +76,9 @@ class Linear:
     memory = 1
 
     def __init__(self, settings: LinearSettings, inputs: int, rng: np.random.Generator) -> None:
-        self.members, self.most, self._prior_std = settings.members, CACHED // settings.members, settings.prior_std
+        self.members = settings.members
+        self.most = CACHED // settings.members
+        self._prior_std = settings.prior_std
         self._quadratic = settings.features == "quadratic"
         size = inputs + (inputs * (inputs + 1) // 2 if self._quadratic else 0)
         half = rng.standard_normal((settings.members // 2, size))
