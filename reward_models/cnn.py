@@ -1,4 +1,9 @@
-"""An ensemble of convolutional networks over (picture, action): a reward for each step."""
+"""An ensemble of convolutional networks over (picture, action): a reward for each step.
+
+Variant: the pixel reward of Christiano et al. 2017 (appendix A.2), smaller by default: 3 x 3 filters at every second
+pixel with ReLU, then perceptrons that also get the action. Frames are stacked by the environment, if at all. Left out:
+batch normalisation and dropout.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""How the members of an ensemble are put together into the one reward that learners optimise."""
+"""How the members of an ensemble are put together into the one reward that learners optimise.
+
+Variants: the mean (Christiano et al. 2017, section 2.2.3), the worst member (Coste et al. 2024), or the mean less
+standard deviations, where their uncertainty-weighted reward takes off the variance. The bonus is RUNE's (Liang et al.
+2022), which shrinks here from fit to fit and not by the policy's step.
+"""
 
 from __future__ import annotations
 

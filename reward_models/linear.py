@@ -1,4 +1,9 @@
-"""A reward that is linear in features of a step, with the posterior of its weights in closed form."""
+"""A reward that is linear in features of a step, with the posterior of its weights in closed form.
+
+Variant: the Bayesian linear reward of Sadigh et al. 2017 with a Gaussian prior and Laplace's approximation (MacKay
+2003, chapter 27), where the paper has a prior on the unit ball and Metropolis samples. The members are draws whose
+noise is fixed when the model is built. Left out: a prior that is learned.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +47,8 @@ class LinearSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
-        found, describe = control(task, f"reward kind {self.kind!r} scores control segments"), self._hand_made()
+        found = control(task, f"reward kind {self.kind!r} scores control segments")
+        describe = self._hand_made()
         network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 
@@ -70,7 +76,9 @@ class Linear:
     memory = 1
 
     def __init__(self, settings: LinearSettings, inputs: int, rng: np.random.Generator) -> None:
-        self.members, self.most, self._prior_std = settings.members, CACHED // settings.members, settings.prior_std
+        self.members = settings.members
+        self.most = CACHED // settings.members
+        self._prior_std = settings.prior_std
         self._quadratic = settings.features == "quadratic"
         size = inputs + (inputs * (inputs + 1) // 2 if self._quadratic else 0)
         half = rng.standard_normal((settings.members // 2, size))

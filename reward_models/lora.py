@@ -1,4 +1,8 @@
-"""Low-rank adapters (LoRA): small matrices beside a model's own, which stay as they are."""
+"""Low-rank adapters: small matrices beside a model's own, which stay as they are.
+
+Variant: LoRA (Hu et al. 2022, section 4.1) by peft, on all linear layers by default, where the paper adapts those of
+attention; scaled by 2 whatever the rank is, without dropout. Left out: biases, and frozen weights in fewer bits.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""An ensemble of small networks over (observation, action): a reward for each step."""
+"""An ensemble of small networks over (observation, action): a reward for each step.
+
+Variant: the networks of Christiano et al. 2017 (appendix A.1: two layers of 64 units), by default with tanh in place of
+leaky ReLU. The output is linear, without the tanh that PEBBLE (Lee et al. 2021) puts on it.
+"""
 
 from __future__ import annotations
 

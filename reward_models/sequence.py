@@ -1,4 +1,9 @@
-"""Rewards that look back: a GRU, and a causal transformer over steps. A step is judged by what led to it."""
+"""Rewards that look back: a GRU, and a causal transformer over steps. A step is judged by what led to it.
+
+Variants: the GRU of Cho et al. 2014 with the reset gate after the product; and the Preference Transformer (Kim et al.
+2023, section 4) with one token a step and preference attention that looks back only, so that each step has a reward of
+its own. Left out: attention to later steps, and dropout.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +49,10 @@ class GRU:
 
     def __init__(self, settings: GRUSettings, inputs: int, memory: int, rng: np.random.Generator) -> None:
         order = generator(rng)
-        self.members, self.memory, width = settings.members, memory, settings.width
-        self.most = CACHED // self.members
+        self.members = settings.members
+        self.memory = memory
+        self.most = CACHED // settings.members
+        width = settings.width
         shapes = {
             "input_weight": (inputs, 3 * width),
             "input_bias": (1, 3 * width),
@@ -69,7 +76,8 @@ class GRU:
         x = inputs.transpose(-3, -2).flatten(-3, -2).expand(self.members, -1, -1)
         # The inputs' share of all gates at once; only the state's share has to go step by step.
         gates = torch.baddbmm(p["input_bias"], x, p["input_weight"]).view(self.members, steps, rows, -1).unbind(1)
-        state, states = inputs.new_zeros(self.members, rows, p["state_weight"].shape[1]), list[Tensor]()
+        state = inputs.new_zeros(self.members, rows, p["state_weight"].shape[1])  # (E, B, H)
+        states: list[Tensor] = []
         for gate in gates:
             state = self._step(gate, state)
             states.append(state)
@@ -130,8 +138,12 @@ class PreferenceTransformer:
         self, settings: PreferenceTransformerSettings, inputs: int, memory: int, rng: np.random.Generator
     ) -> None:
         order = generator(rng)
-        self.members, self.memory, self.most = settings.members, memory, CACHED // settings.members
-        self._heads, self._layers, self._weighted = settings.heads, settings.layers, settings.preference_attention
+        self.members = settings.members
+        self.memory = memory
+        self.most = CACHED // settings.members
+        self._heads = settings.heads
+        self._layers = settings.layers
+        self._weighted = settings.preference_attention
         width = settings.width
         self._p: dict[str, Tensor] = {"place": uniform((settings.members, memory, width), width, order)}
         self._linear("input", inputs, width, order)
@@ -152,7 +164,8 @@ class PreferenceTransformer:
 
     def outputs(self, inputs: Tensor) -> Tensor:
         steps = inputs.shape[-2]
-        x = self._apply("input", inputs.expand(self.members, *inputs.shape[-3:])) + self._p["place"][:, None, :steps]
+        x = self._apply("input", inputs.expand(self.members, *inputs.shape[-3:]))  # (E, B, T, I) -> (E, B, T, width)
+        x = x + self._p["place"][:, None, :steps]  # (E, 1, T, width): every row starts at the first place
         for i in range(self._layers):
             q, k, v = self._apply(f"layer_{i}_qkv", _normed(x)).chunk(3, -1)
             x = x + self._apply(f"layer_{i}_mix", self._attention(q, k, v))

@@ -1,5 +1,8 @@
 """What every reward model for control shares: a network says something of each step, and a segment's score is the sum.
 
+Variant: Christiano et al. 2017, section 2.2.3. Sums have no discount; each member is normalised over the steps of a
+fit, and members are put together step by step. Left out: weights of single steps.
+
 A network is small: it maps normalised steps to outputs, E members at once. All else is here.
 """
 
@@ -98,9 +101,13 @@ class StepReward:
         solve: Solve | None = None,
         describe: Describe | None = None,
     ) -> None:
-        self.network, self._ensemble, self._measure, self._solve = network, ensemble, measure or each_input, solve
-        self._sizes, self._gain = (task.observation_size, task.action_size), gain / task.segment_steps
+        self.network = network
+        self._ensemble = ensemble
+        self._measure = measure or each_input
+        self._solve = solve
         self._describe = describe
+        self._sizes = (task.observation_size, task.action_size)
+        self._gain = gain / task.segment_steps
         width = input_width(task, describe)
         self._input_mean, self._input_std = torch.zeros(width), torch.ones(width)
         self._shift, self._scale = torch.zeros(network.members), torch.ones(network.members)
@@ -243,7 +250,8 @@ class StepReward:
     @torch.no_grad()
     def _of(self, candidates: Sequence[Segment], what: Callable[[Tensor, np.ndarray], Tensor]) -> Floats:
         """(E, S): `what` of the steps of all candidates, one after another."""
-        steps, begins = self._steps(candidates), np.zeros(sum(len(c) for c in candidates), bool)
+        steps = self._steps(candidates)  # (S, I)
+        begins = np.zeros(sum(len(c) for c in candidates), bool)
         begins[_starts(candidates)] = True
         return to_numpy(what(self._normalise_(steps), begins))
 

@@ -1,4 +1,9 @@
-"""A transformer that scores responses: one backbone with E linear heads on the last real token."""
+"""A transformer that scores responses: one backbone with E linear heads, on the last real token of a causal model.
+
+Variant: Stiennon et al. 2020, section 3.4. In place of a mean of 0 over reference summaries, each member has mean 0 and
+std 1 over the candidates of a fit. Members share the backbone and differ in their heads alone. Left out: dropout, and
+scores of single tokens.
+"""
 
 from __future__ import annotations
 

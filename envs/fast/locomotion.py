@@ -52,14 +52,19 @@ class Locomotion:
         self, name: str, make: Callable[[], gymnasium.Env[Any, Any]], count: int, horizon: int, fixed_horizon: bool
     ) -> None:
         env: Any = make().unwrapped
-        self._body, self._model, self._frames, self._dt = BODIES[name], env.model, env.frame_skip, env.dt
+        self._body = BODIES[name]
+        self._model = env.model
+        self._frames = env.frame_skip
+        self._dt = env.dt
         self._first = env.init_qpos.copy(), env.init_qvel.copy()
         self._data = [mujoco.MjData(env.model) for _ in range(count)]
         # Views into each simulator's own memory, made once.
         self._controls = [data.ctrl for data in self._data]
         self._memory = [(data.qpos, data.qvel) for data in self._data]
         self._states = np.zeros((count, env.model.nq + env.model.nv))
-        self._elapsed, self._horizon, self._terminate = np.zeros(count, np.int64), horizon, not fixed_horizon
+        self._elapsed = np.zeros(count, np.int64)
+        self._horizon = horizon
+        self._terminate = not fixed_horizon
         self._rng = np.random.default_rng(0)
 
     def reset(self, rng: np.random.Generator) -> Floats:
@@ -113,7 +118,8 @@ class Locomotion:
     def _observe(self) -> Floats:
         """Positions but the first, and clipped velocities."""
         # A copy, since clipping is in place, and only what is observed is clipped.
-        clip, observations = self._body.velocity_clip, self._states[:, 1:].copy()
+        observations = self._states[:, 1:].copy()
+        clip = self._body.velocity_clip
         velocities = observations[:, self._model.nq - 1 :]
         np.clip(velocities, -clip, clip, out=velocities)
         found: Floats = observations.astype(np.float32)
@@ -123,7 +129,10 @@ class Locomotion:
         body, states = self._body, self._states
         if body.height is None:
             return np.ones(len(states), bool)
-        height, angle, rest = states[:, 1], states[:, 2], np.abs(states[:, 2:])
+        # Column 0 is how far a body has come, which no bound is on.
+        height = states[:, 1]
+        angle = states[:, 2]
+        rest = np.abs(states[:, 2:])  # (n, positions and velocities - 2), the angle among them
         upright = (body.angle[0] < angle) & (angle < body.angle[1])
         within = (body.height[0] < height) & (height < body.height[1])
         healthy: Bools = upright & within & (rest < body.reach).all(1)

@@ -85,7 +85,9 @@ def _argilla_answer(
     if not isinstance(answer, Mapping):
         raise ValueError(f'question {question!r}: expected {{"value", "user_id"}}, got {answer!r:.200}')
     user = str(answer.get("user_id") or "")
-    status, value, labeler = answer.get("status") or "submitted", answer.get("value"), names.get(user, user)
+    labeler = names.get(user, user)
+    status = answer.get("status") or "submitted"
+    value = answer.get("value")
     several = list(texts.values())
     if status == "discarded":
         return _row("skip", "incomparable" if value == "incomparable" else "skip", prompt, several, labeler)
@@ -154,7 +156,8 @@ def _task(data: Fields) -> tuple[str, list[str]]:
             f"expected two texts ({tried}) in the task's data, got {', '.join(map(str, data))}: "
             "name them with --map left=...,right=..."
         )
-    prompt, texts = next((data[name] for name in PROMPTS if name in data), ""), [data[name] for name in pair]
+    prompt = next((data[name] for name in PROMPTS if name in data), "")
+    texts = [data[name] for name in pair]
     if not all(isinstance(text, str) for text in [prompt, *texts]):
         raise ValueError(f"expected text in the task's data, got {data!r:.200}")
     return prompt, texts

@@ -121,7 +121,8 @@ class _Descent(Generic[C]):
         """Returns the epochs run."""
         measured = bool(len(self.problem.test.labeler))
         patience = self.fitting.patience if measured else 0
-        best, epoch, best_epoch = float("inf"), 0, 0
+        best = float("inf")
+        epoch = best_epoch = 0
         kept = self._copies()  # also of what is learned beside the reward, which the scores belong to
         while epoch < self.fitting.epochs and (not patience or epoch - best_epoch < patience):
             epoch += 1
@@ -129,7 +130,9 @@ class _Descent(Generic[C]):
             if measured and self.fitting.weight_decay == "adaptive":
                 self._adapt()
             if patience and (loss := ensemble_loss(self.problem, self.problem.test)) < best:
-                best, kept, best_epoch = loss, self._copies(), epoch
+                best = loss
+                best_epoch = epoch
+                kept = self._copies()
         if patience:
             torch._foreach_copy_([p.data for p in self._all()], kept)
         return epoch

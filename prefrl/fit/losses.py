@@ -1,5 +1,9 @@
 """Likelihoods of judgements, on scores alone: one set of losses for control, text and ensembles.
 
+Variants: Luce's choice (for pairs Bradley and Terry's, stage by stage Plackett's), with ties after Davidson, one
+parameter for all sizes of a tie, or after Rao and Kupper, for pairs only; ratings are McCullagh's cumulative logits.
+Any of them may allow for wrong answers. Left out: margins, and ties or rating thresholds of each labeler's own.
+
 Shapes: E members, S choices among at most K candidates each, R ratings. All are stable for scores of any size, and
 unchanged when all scores (and, for ratings, the thresholds) are shifted together.
 """

@@ -1,4 +1,9 @@
-"""Labels that a reward model finds improbable: left out, or turned round (RIME, Cheng et al. 2024)."""
+"""Labels that a reward model finds improbable: left out, or turned round.
+
+Variant: the denoising discriminator of RIME (Cheng et al. 2024, section 4.2), asked once an epoch. Its spread is that
+of all losses of the epoch, where the authors' code keeps a running variance of the trusted ones. Judgements of every
+kind are filtered, but only pairs are turned round. Left out: the warm start of the reward model.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Learning from behaviours that nobody judged (SURF, Park et al. 2022): pseudo-labels, and cropped segments."""
+"""Learning from behaviours that nobody judged: pseudo-labels, and cropped segments.
+
+Variant: SURF (Park et al. 2022, sections 4.1 and 4.2). The ensemble's mean labels a pair for all members, and sees the
+segments as they were cropped; in the authors' code each member labels for itself, from uncropped ones. One length holds
+for all windows of a gradient step, where theirs draws one for each pair. Left out: windows that reach beyond
+a segment.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A crowd of simulated teachers, each with faults of its own."""
+"""A crowd of simulated teachers, each with faults of its own.
+
+Variant: our own. Each annotator is an `Oracle`, so one of B-Pref's teachers (Lee et al. 2021), and draws its noise
+apart from the others; who judges a query is drawn at random. Left out: faults that annotators share, and giving a query
+to those who are good at it.
+"""
 
 from __future__ import annotations
 

@@ -141,12 +141,14 @@ class Oracle:
         return replace(found, length_price=price, length_mean=float(np.concatenate(sizes).mean()))
 
     def _with_thresholds(self, found: Limits, asked: Survey[C], seen: list[Floats]) -> Limits:
-        s, below, within = self.settings, found.skip_below, found.tie_within
+        s = self.settings
+        below = found.skip_below
+        within = found.tie_within
         if s.skip_rate:
             below = teachers.skip_threshold(seen, s.skip_rate)
         if s.skip_epsilon and (threshold := teachers.session_threshold(asked, s.skip_epsilon, s.bpref_compat)) > 0:
             below = threshold
-        kept = _unskipped(seen, below)
+        kept = _unskipped(seen, below)  # ties are a share of what is judged, so what is skipped goes first
         if s.tie_rate and kept:
             within = teachers.tie_threshold(kept, s.tie_rate)
         if s.tie_epsilon:
@@ -154,13 +156,16 @@ class Oracle:
         return replace(found, skip_below=below, tie_within=within)
 
     def _with_noise(self, found: Limits, seen: list[Floats]) -> Limits:
-        s, beta, kept = self.settings, found.rationality, _unskipped(seen, found.skip_below)
+        s = self.settings
+        beta = found.rationality
+        kept = _unskipped(seen, found.skip_below)
         if s.error_rate and kept:
             beta = teachers.rationality_for(kept, found.tie_within, s.error_rate)
         if s.judgement != "rating":
             return replace(found, rationality=beta)
-        levels = np.quantile(np.concatenate([block.ravel() for block in seen]), np.arange(1, s.scale) / s.scale)
-        return replace(found, rationality=beta, cuts=tuple(levels.tolist()))
+        every = np.concatenate([block.ravel() for block in seen])  # blocks differ in K
+        cuts = np.quantile(every, np.arange(1, s.scale) / s.scale)  # (scale - 1,)
+        return replace(found, rationality=beta, cuts=tuple(cuts.tolist()))
 
     def see(self, query: Query[C], gold: Sequence[Floats], limits: Limits) -> Floats:
         """(K,) what each candidate seems to be worth: its gold, discounted, plus what its length adds."""

@@ -1,7 +1,10 @@
 """How a simulated teacher's noise is tied to the task: thresholds and rationality from the gold of what was asked.
 
-Gold comes on any scale, so no absolute number suits every task. Everything here works on blocks: an array (Q, K) of
-what the teacher sees in Q queries of K candidates, one block for each K.
+Variant: the teachers of B-Pref (Lee et al. 2021, section 4.2) for K candidates, ties being groups of near ones. Gold
+comes on any scale, so no absolute number suits every task: thresholds and beta can be found from rates on what was
+asked so far; the paper's own adaptive threshold is `session_threshold`. The draws themselves are in `label/oracle.py`.
+
+Everything here works on blocks: an array (Q, K) of what the teacher sees in Q queries of K candidates, one for each K.
 """
 
 from __future__ import annotations

@@ -48,7 +48,11 @@ class Cards:
     """Makes the cards. May be used from any thread; it reads from the disk what it does not remember."""
 
     def __init__(self, events: EventLog, kind: str, fps: float, lease: float, clips: ClipSource | None) -> None:
-        self._log, self._kind, self._fps, self._lease, self._clips = events, kind, fps, lease, clips
+        self._log = events
+        self._kind = kind
+        self._fps = fps
+        self._lease = lease
+        self._clips = clips
         self._known: OrderedDict[str, list[Json]] = OrderedDict()
         self._lock = threading.Lock()
 

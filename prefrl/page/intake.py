@@ -162,7 +162,9 @@ class Intake:
 
 def in_item_space(sent: api.Answer, given: Given, strengths: dict[str, float]) -> Answer:
     """An answer in the query's own order. Raises `Refused` where it does not fit the question."""
-    query, name, shown = given.query, given.annotator, given.shown
+    query = given.query
+    name = given.annotator
+    shown = given.shown
     if sent.outcome in ("skip", "incomparable"):
         return Skip(query, "skip" if sent.outcome == "skip" else "incomparable", name, shown)
     if sent.outcome == "ranking" or len(shown) > 2:

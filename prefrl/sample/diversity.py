@@ -1,4 +1,9 @@
-"""Points that differ from one another, out of (Q, D) features of queries. Ties go to the first, so order counts."""
+"""Points that differ from one another, out of (Q, D) features of queries. Ties go to the first, so order counts.
+
+Variants: greedy k-center (Gonzalez 1985); medoids (Biyik and Sadigh 2018), by the alternation of Park and Jun 2009 from
+k-center in place of their own start; and the greedy mode of a determinantal point process (Biyik et al. 2019), with the
+median distance as its scale. Left out: boundary medoids and successive elimination, also of the 2018 paper.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Which candidates are worth a label. One signature for control and text: a query's candidates share a context."""
+"""Which candidates are worth a label. One signature for control and text: a query's candidates share a context.
+
+Variants: uniform; greedy k-center; or the best of many random proposals by an ensemble's spread (Christiano et al.
+2017, section 2.2.4), its entropy, or BALD (Houlsby et al. 2011). No two queries of a round share a candidate, and a
+round's best may be thinned to a diverse batch. Left out: distance to what earlier rounds asked.
+"""
 
 from __future__ import annotations
 

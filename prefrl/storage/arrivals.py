@@ -141,7 +141,9 @@ def check_arrivals(events: Iterable[Event], blobs: Path, connection: Connection 
 
     Raises `ValueError` naming the first bad event, and `StoreError` with all that contradicts the store.
     """
-    arrivals, against, read, known = _Arrivals(blobs, _kind(connection)), Against(), 0, 0
+    arrivals = _Arrivals(blobs, _kind(connection))
+    against = Against()
+    read = known = 0
     for some in chunks(enumerate(events, 1), CHUNK):
         for number, one in some:
             try:

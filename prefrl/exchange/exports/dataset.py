@@ -143,7 +143,9 @@ def _protocol(store: Store) -> str:
 
 def _figures(store: Store) -> tuple[dict[str, int], int, str]:
     """Answers by kind, how many annotators there are, and how often two of them agree."""
-    kinds, labelers, sides = dict[str, int](), set[str](), dict[str, list[int]]()
+    kinds: dict[str, int] = {}
+    labelers: set[str] = set()
+    sides: dict[str, list[int]] = {}  # query -> 1, 0 or -1 for each comparison: first, tie or second
     for given in each_answer(store):
         name = given.answer.reason or answer_kind(given.answer)
         kinds[name] = kinds.get(name, 0) + 1

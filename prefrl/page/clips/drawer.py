@@ -80,7 +80,10 @@ class Drawer:
 
     def __init__(self, command: Sequence[str], limit: float, first_limit: float, most_jobs: int) -> None:
         """Time limits in seconds, the first one for a process's first job; after `most_jobs` it is replaced."""
-        self._command, self._limit, self._first_limit, self._most_jobs = list(command), limit, first_limit, most_jobs
+        self._command = list(command)
+        self._limit = limit
+        self._first_limit = first_limit
+        self._most_jobs = most_jobs
         self._child: _Child | None = None
         self._closed = False
         self._turn = Lock()
