@@ -18,8 +18,8 @@ from torch import Tensor
 from prefrl.improve.objectives import (
     Reduction,
     clipped_surrogate,
-    kl_k2,
     kl_k3,
+    kl_loss,
     log_ratio,
     masked_sum,
     policy_gradient,
@@ -46,7 +46,7 @@ class Objective:
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     beta: float = 0.0
-    """Weight of the KL to the reference, as a loss."""
+    """Weight of the KL of whole sequences to the reference, as a loss."""
     reduction: Reduction = "token"
     """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
     max_grad_norm: float = math.inf
@@ -194,9 +194,7 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
         gain = clipped_surrogate(ratios, batch.advantages, objective.clip)
     if objective.beta:
         assert batch.reference is not None
-        # Token by token: not the gradient of the whole sequence's KL, for it does not credit a token with what its
-        # choice does to the KL of later ones. The KL in the reward does.
-        gain = gain + objective.beta * kl_k2(logp, batch.reference)
+        gain = gain + objective.beta * kl_loss(ratios, logp, batch.reference, batch.inputs.mask)
     return gain
 
 

@@ -1,8 +1,8 @@
 """Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE.
 
 Variant: one advantage a response, no critic; the KL of each token is taken off the reward before the baseline (k1), or
-added to the loss (k2); the penalty for a missing end comes before the baseline too. GRPO as published puts k3 into the
-loss, whose gradient is that of the other direction.
+its gradient is added to the loss's; the penalty for a missing end comes before the baseline too. GRPO as published puts
+k3 into the loss, whose gradient is that of the other direction.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class TextLearnerSettings(Settings):
 
     kind: Literal["text"] = "text"
     algorithm: Literal["rloo", "grpo", "reinforce"] = "rloo"
-    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with k2 as the KL), or reinforce
-    (Williams 1992) with the batch's mean as its baseline. Anything that is set beside it stands."""
+    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with the KL's own gradient), or
+    reinforce (Williams 1992) with the batch's mean as its baseline. Anything that is set beside it stands."""
     updates: int = Field(15, ge=1)
     """Batches of a round."""
     prompts: int = Field(16, ge=1)
@@ -66,7 +66,7 @@ class TextLearnerSettings(Settings):
     beta: float = Field(0.3, ge=0)
     """Weight of the KL to the starting policy, in units of reward a nat."""
     kl_in: Literal["reward", "loss"] = "reward"
-    """Where the KL goes: into the reward (k1 of each token, before the baseline), or into the loss (k2)."""
+    """Where the KL goes: into the reward (k1 of each token, before the baseline), or into the loss."""
     kl_target: float | None = Field(None, gt=0)
     """Steer beta to this KL in nats per response (Ziegler et al. 2019); null leaves it alone."""
     kl_horizon: float = Field(10_000.0, gt=0)
@@ -260,7 +260,7 @@ def text_formula(settings: TextLearnerSettings) -> str:
     if settings.clip is not None:
         gain = f"min(r A_i, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) A_i)"
     kl = f"{settings.beta:g}" + (f" (steered to {settings.kl_target:g} nats)" if settings.kl_target else "")
-    in_loss = f" - {kl} (log pi(y_t) - log ref(y_t))^2 / 2" if settings.beta and settings.kl_in == "loss" else ""
+    in_loss = f" - {kl} KL[pi(y), ref(y)]" if settings.beta and settings.kl_in == "loss" else ""
     in_reward = f" - {kl} sum_t [log pi_old(y_t) - log ref(y_t)]" if settings.beta and not in_loss else ""
     lines = [
         f"maximise  {AVERAGES[settings.reduction]} [ {gain}{in_loss} ]",

@@ -91,14 +91,18 @@ def test_a_step_is_the_gradient_of_the_objective_written_out() -> None:
     mask, steps = batch.inputs.mask, batch.inputs.mask.sum()
     assert batch.returns is not None
     assert batch.reference is not None
+    apart = ((logp - batch.reference) * mask).detach()
+    to_go = torch.stack([apart[:, t:].sum(1) for t in range(L)], 1)  # a choice is charged for what comes after it too
     loss = (
         (-logp * batch.advantages * mask).sum()
-        + 0.3 * ((logp - batch.reference) ** 2 / 2 * mask).sum()
+        + 0.3 * (logp * to_go * mask).sum()
         + 0.5 * ((policy.values(batch.inputs) - batch.returns) ** 2 / 2 * mask).sum()
         - 0.1 * (entropy * mask).sum()
     ) / steps
     torch.testing.assert_close(found, list(torch.autograd.grad(loss, policy.parameters())))
-    assert metrics["loss"] == pytest.approx(float(loss.detach()))
+    # The KL counts as its own number, not as its gradient's weights.
+    value = float(loss.detach()) + 0.3 * float((apart - logp.detach() * to_go).sum() / steps)
+    assert metrics["loss"] == pytest.approx(value)
     norm = torch.cat([g.flatten() for g in found]).norm()
     assert metrics["grad_norm"] == pytest.approx(float(norm))
 

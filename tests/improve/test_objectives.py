@@ -120,9 +120,15 @@ def test_k1_and_k3_are_unbiased_estimates_of_the_kl() -> None:
     assert (o.kl_k3(sequence_logp(THETA), sequence_logp(REF)) >= 0).all()
 
 
-def test_as_a_loss_only_k2_has_the_gradient_of_the_kl() -> None:
-    logp, ref = sequence_logp(THETA), sequence_logp(REF)
-    torch.testing.assert_close(gradient(expected(o.kl_k2(logp, ref))), gradient(exact_kl(THETA, REF)))
+def test_the_kl_as_a_loss_has_the_value_and_the_gradient_of_the_sequences_kl() -> None:
+    logp, ref, mask = token_logp(THETA), token_logp(REF), torch.ones_like(token_logp(REF))
+    on_policy = o.kl_loss(logp - logp.detach(), logp, ref, mask)
+    torch.testing.assert_close(expected(on_policy.sum(1)), exact_kl(THETA, REF))
+    torch.testing.assert_close(gradient(expected(on_policy.sum(1))), gradient(exact_kl(THETA, REF)))
+
+
+def test_as_a_loss_neither_k1_nor_k3_will_do() -> None:
+    ref = sequence_logp(REF)
     zero = torch.zeros_like(THETA)
     torch.testing.assert_close(gradient(expected(o.kl_k1(sequence_logp(THETA), ref))), zero)
     reverse = gradient(exact_kl(REF, THETA))

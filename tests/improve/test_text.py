@@ -327,7 +327,7 @@ def test_the_formula_says_what_the_settings_say() -> None:
     other = TextLearnerSettings(
         clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised"
     )
-    assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 (log pi(y_t) - log ref(y_t))^2 / 2" in other.formula()
+    assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 KL[pi(y), ref(y)]" in other.formula()
     assert "ref" not in text_formula(TextLearnerSettings(beta=0.0))
 
 
