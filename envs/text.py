@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import hashlib
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,11 +13,10 @@ from vaderSentiment.vaderSentiment import SentimentIntensityAnalyzer
 
 from prefrl.components import Settings
 from prefrl.envs.grammar import Grammar
+from prefrl.envs.prompts import is_for_evaluation
 from prefrl.envs.reviews import reviews, source
 from prefrl.policies.cloning import CloningSettings
 from prefrl.types import Floats, Response
-
-EVALUATION_SHARE = 8
 
 
 class ReviewsSettings(Settings):
@@ -54,6 +52,7 @@ class Reviews:
     ) -> None:
         self.response_tokens = settings.response_tokens
         self.tokenizer = tokenizer
+        self.ends = (int(tokenizer.eos_token_id),)
         self._model = model
         self._grammar = grammar
         self._vader = SentimentIntensityAnalyzer()
@@ -61,6 +60,12 @@ class Reviews:
     def model(self) -> LlamaForCausalLM:
         """A fresh copy of the cloned model, in float32; it has no dropout."""
         return copy.deepcopy(self._model)
+
+    def encode(self, prompt: str) -> tuple[int, ...]:
+        return tuple(self.tokenizer.encode(prompt))
+
+    def columns(self, prompt: str) -> Mapping[str, Any]:
+        return {}
 
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
         return self._draw(count, rng, evaluation=False)
@@ -85,11 +90,6 @@ class Reviews:
         found: list[str] = []
         while len(found) < count:
             prompt, _ = self._grammar.sample(rng)
-            if for_evaluation(prompt) == evaluation:
+            if is_for_evaluation(prompt) == evaluation:
                 found.append(prompt)
         return found
-
-
-def for_evaluation(prompt: str) -> bool:
-    """By a digest of the words: the split is the same in every run."""
-    return hashlib.sha256(prompt.encode()).digest()[0] % EVALUATION_SHARE == 0

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -20,11 +21,9 @@ from transformers import (
 )
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.text import for_evaluation
-from prefrl.exchange.formats import read_judgements
-from prefrl.kinds import only
+from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts
 from prefrl.policies.cloning import make_tokenizer
-from prefrl.policies.pretrained import load_tokenizer, load_weights
+from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
 from prefrl.types import Floats, Response
 
 ONLY_BYTES = 259
@@ -32,15 +31,26 @@ ONLY_BYTES = 259
 
 
 class TextsSettings(Settings):
-    """Texts whose value only people know: for judgements from files."""
+    """Prompts from a file, answered by your own model; what a response is worth, people or a reward say."""
 
     kind: Literal["texts"] = "texts"
     prompts: Path | None = None
-    """A file of judgements whose prompts are answered; not needed to fit a reward model. One in eight is kept for
-    evaluation."""
+    """A file, or a folder of a data set, whose prompts are answered: rows with `prompt` or `messages`, whose other
+    columns reward functions are given, or judgements. Not needed to fit a reward model."""
+    evaluation_prompts: Path | None = None
+    """Prompts to evaluate on; without them one in eight of the others is kept for it."""
     model: Path | None = None
-    """A folder with a causal model of transformers and its tokenizer; without one a small Llama over bytes is made
-    whose weights are random: it knows no language, and is a floor to compare with."""
+    """A folder with a causal model of transformers and its tokenizer, or a .gguf file; without one a small Llama over
+    bytes is made whose weights are random: it knows no language, and is a floor to compare with."""
+    dtype: Precision = "float32"
+    """Of the model's weights."""
+    chat_template: bool | None = None
+    """Whether a prompt is put into the tokenizer's chat template; by default where it has one."""
+    system: str = ""
+    """A system prompt for conversations that have none; needs a chat template."""
+    long_prompts: Long = "refuse"
+    """What happens to prompts that leave no room for a response in the model's context: refuse them, cut them to their
+    end, or skip them."""
     response_tokens: int = Field(256, ge=2)
     """The most tokens that a response may have, the end token included."""
     layers: int = Field(2, ge=1)
@@ -55,13 +65,49 @@ class TextsSettings(Settings):
     def shrunk(self) -> TextsSettings:
         return self.model_copy(update={"response_tokens": 8, "layers": 1, "width": 16, "heads": 2})
 
+    def identity(self) -> Self:
+        """Without where its prompts come from, and how long responses may be: a reward model hangs on neither."""
+        names = ("prompts", "evaluation_prompts", "long_prompts", "response_tokens", "dtype")
+        return self.model_copy(update={name: type(self).model_fields[name].default for name in names})
+
     def build(self) -> Texts:
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
-        model, tokenizer = _load(self.model) if self.model else _small(self)
-        judged = read_judgements(self.prompts).judged if self.prompts else ()
-        refusal = ConfigError(f"task.prompts: {self.prompts} holds segments; expected responses to prompts")
-        first = only(Response, [one.query.candidates[0] for one in judged], refusal)
-        return Texts(self.response_tokens, tokenizer, model, tuple({one.prompt: 0 for one in first}))
+        model, tokenizer = _load(self.model, self.dtype) if self.model else _small(self)
+        opening = self._opening(model, tokenizer)
+        learning, left_out = _known(self.prompts, opening)
+        kept, skipped = _known(self.evaluation_prompts, opening)
+        own = set(kept) if kept else for_evaluation(list(learning))
+        return Texts(
+            self.response_tokens,
+            tokenizer,
+            model,
+            _ends(model, tokenizer),
+            opening,
+            learning | kept,
+            tuple(prompt for prompt in learning if prompt not in own),
+            tuple(prompt for prompt in learning | kept if prompt in own),
+            notes=(*left_out, *skipped),
+        )
+
+    def _opening(self, model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> Opening:
+        has = tokenizer.chat_template is not None
+        chat = has if self.chat_template is None else self.chat_template
+        if chat and not has:
+            raise ConfigError(f"task.chat_template is true, but the tokenizer of {self.model} has no chat template")
+        if self.system and not chat:
+            raise ConfigError(
+                "task.system needs a chat template: the tokenizer has none, or task.chat_template is false"
+            )
+        if chat:
+            check_template(tokenizer)
+        known = getattr(model.config, "max_position_embeddings", None)  # some architectures have no bound
+        room = None if known is None else int(known) - self.response_tokens
+        if room is not None and room < 1:
+            raise ConfigError(
+                f"task.response_tokens={self.response_tokens} leaves no room for a prompt in the model's context of "
+                f"{known} tokens: set it lower"
+            )
+        return Opening(tokenizer, chat, self.system, room, self.long_prompts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +117,27 @@ class Texts:
     response_tokens: int
     tokenizer: PreTrainedTokenizerBase
     start: PreTrainedModel
-    known: tuple[str, ...]
-    """Distinct prompts; none where there is no file of them."""
+    ends: tuple[int, ...]
+    encode: Opening
+    known: Mapping[str, Mapping[str, Any]]
+    """Distinct prompts, and what else their rows say; none where there is no file of them."""
+    learning: tuple[str, ...]
+    evaluating: tuple[str, ...]
     name: str = "texts"
     kind: str = "text"
+    notes: tuple[str, ...] = field(default=())
 
     def model(self) -> PreTrainedModel:
         return copy.deepcopy(self.start)
 
+    def columns(self, prompt: str) -> Mapping[str, Any]:
+        return self.known.get(prompt, {})
+
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
-        return self._draw(count, rng, evaluation=False)
+        return _drawn(self.learning, count, rng, "to learn on")
 
     def evaluation_prompts(self, count: int, rng: np.random.Generator) -> list[str]:
-        return self._draw(count, rng, evaluation=True)
+        return _drawn(self.evaluating, count, rng, "to evaluate on (one in eight is)")
 
     def gold(self, responses: Sequence[Response]) -> Floats:
         """(N,) NaN: only people know."""
@@ -93,12 +147,54 @@ class Texts:
         """None: only people can tell."""
         return None
 
-    def _draw(self, count: int, rng: np.random.Generator, evaluation: bool) -> list[str]:
-        prompts = [prompt for prompt in self.known if for_evaluation(prompt) == evaluation]
-        if not prompts:
-            purpose = "to evaluate on (one in eight is)" if evaluation else "to learn on"
-            raise ConfigError(f"task.prompts: {len(self.known)} prompts leave none {purpose}; give a file with more")
-        return [prompts[i] for i in rng.integers(len(prompts), size=count)]
+
+def _drawn(prompts: Sequence[str], count: int, rng: np.random.Generator, purpose: str) -> list[str]:
+    if not prompts:
+        raise ConfigError(f"task.prompts: there is no prompt {purpose}; give a file with two or more")
+    return [prompts[i] for i in rng.integers(len(prompts), size=count)]
+
+
+def _known(path: Path | None, opening: Opening) -> tuple[dict[str, Mapping[str, Any]], tuple[str, ...]]:
+    """The distinct prompts of a file with their columns, in their order, and what people should know of the others.
+
+    Raises `ValueError` where a prompt does not fit and is to be refused, and where one has two sets of columns.
+    """
+    found: dict[str, Mapping[str, Any]] = {}
+    counts: Counter[str] = Counter()
+    for prompt in read_prompts(path) if path else ():
+        if prompt.text in found:
+            _check_repeated(prompt, found[prompt.text])
+            continue
+        if not _fits(prompt, opening):
+            counts[opening.long] += 1
+            if opening.long == "skip":
+                continue
+        found[prompt.text] = prompt.columns
+    done = {"cut": "cut to the room that the model's context leaves", "skip": "left out: the context has no room"}
+    return found, tuple(f"{path}: {count} long prompts {done[how]}" for how, count in counts.items())
+
+
+def _check_repeated(prompt: Prompt, before: Mapping[str, Any]) -> None:
+    if prompt.columns != before:
+        names = [n for n in {**before, **prompt.columns} if before.get(n) != prompt.columns.get(n)]
+        judged = {"chosen", "rejected", "completion", "label", "responses", "margin"}
+        if set(names) - judged:
+            raise ValueError(
+                f"{prompt.place}: this prompt stood there before with another {names[0]!r}: rewards are given the "
+                "columns of a prompt, so that there can be one of each"
+            )
+
+
+def _fits(prompt: Prompt, opening: Opening) -> bool:
+    """Whether the model's context has room for it. Raises `ValueError` with its row where such prompts are refused."""
+    try:
+        if opening.fits(prompt.text):
+            return True
+        if opening.long == "refuse":
+            opening(prompt.text)  # says why
+    except ValueError as error:
+        raise ValueError(f"{prompt.place}: {error}") from None
+    return False
 
 
 def _small(settings: TextsSettings) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:
@@ -125,14 +221,25 @@ def _small(settings: TextsSettings) -> tuple[PreTrainedModel, PreTrainedTokenize
     return model, tokenizer
 
 
-def _load(folder: Path) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:
-    """A model and its tokenizer from a folder: safetensors only, no code of its own, nothing downloaded."""
-    if not folder.is_dir():
-        raise ConfigError(f"task.model: {folder} is no folder; expected one that save_pretrained wrote")
+def _load(path: Path, dtype: Precision) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:
+    """A model and its tokenizer from a folder or a .gguf file: no code of its own, nothing downloaded."""
+    if not path.is_dir() and not (path.is_file() and path.suffix == ".gguf"):
+        raise ConfigError(f"task.model: {path} is no folder; expected one that save_pretrained wrote, or a .gguf file")
     try:
-        model, tokenizer = load_weights(AutoModelForCausalLM, folder, False), load_tokenizer(folder, False)
+        model = load_weights(AutoModelForCausalLM, path, False, dtype=dtype)
+        return model, load_tokenizer(path, False)
     except ConfigError as error:
         raise ConfigError(f"task.model: {error}") from error
-    if tokenizer.eos_token_id is None:
-        raise ConfigError(f"task.model: the tokenizer in {folder} has no end token, so that no response could end")
-    return model, tokenizer
+
+
+def _ends(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
+    """Every token that ends a response: chat models have two. Raises `ConfigError` where there is none."""
+    said = model.generation_config.eos_token_id if model.generation_config else None
+    given = said if isinstance(said, list) else [said]
+    found = dict.fromkeys(int(end) for end in [tokenizer.eos_token_id, *given] if end is not None)
+    if not found:
+        raise ConfigError(
+            "task.model: neither the tokenizer nor the generation config has an end token, so that no response could "
+            "end: set eos_token in tokenizer_config.json"
+        )
+    return tuple(found)

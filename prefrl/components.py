@@ -38,6 +38,10 @@ class Settings(BaseModel):
         """The same without what may change from one start of a run to the next, such as a port."""
         return self
 
+    def identity(self) -> Self:
+        """What makes two tasks one for a reward model that was fitted on either."""
+        return self
+
     def asks_people(self) -> bool:
         """Whether a labeler speaks to people, and so needs the terminal for itself."""
         return False
@@ -72,6 +76,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "preference_transformer": "prefrl.reward_models.sequence:PreferenceTransformerSettings",
         "linear": "prefrl.reward_models.linear:LinearSettings",
         "transformer": "prefrl.reward_models.text:TransformerSettings",
+        "functions": "prefrl.reward_models.functions:FunctionsSettings",
     },
     "learners": {
         "control": "prefrl.improve.control:ControlLearnerSettings",

@@ -33,6 +33,15 @@ class Task(Protocol):
         """The name of the kind of its candidates, see `prefrl.kinds`."""
 
 
+@runtime_checkable
+class Noted(Protocol):
+    """A task of which people should know something."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Whole sentences, such as how many prompts were left out."""
+
+
 class DrawnTask(Task, Protocol[C_contra]):
     """A task whose candidates are shown as clips."""
 
@@ -148,8 +157,18 @@ class TextTask(Task, Protocol):
     def response_tokens(self) -> int:
         """The most tokens that a response may have, the end token included."""
 
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """The tokens that end a response."""
+
     def model(self) -> PreTrainedModel:
-        """A fresh copy of the starting policy, in float32, with dropout off."""
+        """A fresh copy of the starting policy, with dropout off."""
+
+    def encode(self, prompt: str) -> tuple[int, ...]:
+        """The tokens of a prompt that the policy goes on from: with one begin token, or in its chat template."""
+
+    def columns(self, prompt: str) -> Mapping[str, Any]:
+        """What else is known of a prompt, a correct answer say: for reward functions."""
 
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
         """Prompts to learn and to ask about."""
@@ -413,6 +432,7 @@ __all__ = [
     "Labeler",
     "LabelerSettings",
     "Learner",
+    "Noted",
     "LearnerSettings",
     "Policy",
     "RewardModel",

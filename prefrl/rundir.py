@@ -19,7 +19,7 @@ from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
-from prefrl.protocols import Attended, RewardModel, Task
+from prefrl.protocols import Attended, Noted, RewardModel, Task
 from prefrl.report.examples import save_examples
 from prefrl.report.report import write_report
 from prefrl.seeding import streams
@@ -55,6 +55,8 @@ class Run:
         try:
             _claim(config, self.folder, self.store)
             self.loop: Loop = config.build(self.store)
+            if isinstance(self.loop.task, Noted):
+                self.notes += self.loop.task.notes
             self._start_from(reward)
             self._rows = self._restore()
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
@@ -108,8 +110,9 @@ class Run:
         kept = self.folder / "reward"
         if reward is not None:
             given = open_saved(reward)
-            if given.config.task != self.config.task:
-                difference = _difference(given.config.task, self.config.task)
+            there, here = given.config.task.identity(), self.config.task.identity()
+            if there != here:
+                difference = _difference(there, here)
                 raise RunError(f"{reward} was fitted on another task (task.{difference})")
             if kept.exists() and _hash(kept) != _hash(given.folder):
                 raise RunError(

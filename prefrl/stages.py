@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from prefrl.storage.checkpoints import load_state
 from prefrl.storage.files import check_free, read_lines, write_file
 from prefrl.store import Store
 from prefrl.types import Evaluation, Fitted, Json, Query, Response
+
+if TYPE_CHECKING:  # a control user loads no transformers
+    from prefrl.policies.language import LanguagePolicy
 
 Tell = Callable[[str], None]
 """How a person is told something while a stage goes on."""
@@ -169,10 +172,58 @@ def export_classifier(saved: Path, to: Path) -> float:
     return save_classifier(reward.backbone, *reward.mean_head(), to)
 
 
+def policy_of(folder: Path) -> LanguagePolicy:
+    """The newest policy of a run of text. Raises `RunError` where the run has none."""
+    from prefrl.improve.writer import WritesText
+    from prefrl.policies.language import LanguagePolicy
+
+    saved = open_saved(folder)
+    learner = saved.config.build_learner(saved.config.build_task(), streams(saved.config.seed, 0).build)
+    if not isinstance(learner, WritesText) or not isinstance(learner.policy, LanguagePolicy):
+        raise RunError(f"{folder}: its policy is no language model; expected a run of a text task")
+    try:
+        learner.load(load_state(saved.folder, "learner"))
+    except ValueError as error:
+        raise RunError(f"{folder} holds no policy: {error}") from error
+    return learner.policy
+
+
+def generate(
+    folder: Path, prompts: Path, sampling: Drawn, seed: int = 0, batch: int = 16
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Each prompt of a file with the responses of a run's newest policy, `batch` prompts at a time."""
+    from prefrl.envs.prompts import read_prompts
+
+    policy, texts = policy_of(folder), [one.text for one in read_prompts(prompts)]
+    how = replace(policy.sampling(sampling.samples, sampling.temperature), top_k=sampling.top_k, top_p=sampling.top_p)
+    for start in range(0, len(texts), batch):
+        some = texts[start : start + batch]
+        drawn = policy.respond(some, how.samples, np.random.default_rng([seed, start]), how)
+        found = [one.text for one in drawn.candidates(policy.task.tokenizer)]
+        for i, prompt in enumerate(some):
+            yield prompt, tuple(found[i * how.samples : (i + 1) * how.samples])
+
+
+class Drawn(NamedTuple):
+    """How responses are drawn, see `prefrl.policies.generate.Sampling`."""
+
+    samples: int = 1
+    temperature: float = 1.0
+    top_k: int = 0
+    top_p: float = 1.0
+
+
 def with_reward(config: Config, saved: Path) -> Config:
-    """Settings that improve a policy against a saved reward model, and ask nobody."""
-    reward = open_saved(saved).config.reward
-    return config.model_copy(update={"reward": reward, "loop": config.loop.model_copy(update={"labels": 0})})
+    """Settings that improve a policy against a saved reward model, and ask nobody.
+
+    What they do not say of the task is as it was when the reward model was fitted: its model and its tokenizer, say.
+    """
+    fitted = open_saved(saved).config
+    update: Json = {"reward": fitted.reward, "loop": config.loop.model_copy(update={"labels": 0})}
+    if type(fitted.task) is type(config.task):
+        said = {name: getattr(config.task, name) for name in config.task.model_fields_set}
+        update["task"] = fitted.task.model_copy(update=said)
+    return config.model_copy(update=update)
 
 
 def evaluate(folder: Path) -> Evaluation:

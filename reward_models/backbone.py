@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -34,8 +34,11 @@ class Backbone:
     model: PreTrainedModel
     """In evaluation mode, so without dropout, in fits as well."""
     tokenizer: PreTrainedTokenizerBase
-    policy_end: int | None
-    """The policy's end token where the tokens it sampled must be encoded anew, None where they are read as they are."""
+    ends: tuple[int, ...]
+    """The policy's end tokens: what a response that has ended has last."""
+    opened: Callable[[str], Sequence[int]] | None
+    """A prompt's tokens as the policy reads it, where sampled tokens are read as they are; None where the text is
+    encoded anew."""
     width: int
     """Of what the heads see."""
     pool: Pool = "last"
@@ -50,7 +53,7 @@ class Backbone:
         """The most tokens that the model has positions for."""
         known = [getattr(self.model.config, "max_position_embeddings", None)]  # some architectures have no bound
         known += _after_padding(self.model)
-        if self.policy_end is not None:
+        if self.opened is None:
             known.append(self.tokenizer.model_max_length)
         return min((int(n) for n in known if n), default=None)
 
@@ -91,15 +94,15 @@ class Backbone:
 
     def _encode(self, response: Response) -> list[int]:
         """As sampled, where the backbone reads the policy's tokens; else from the text, with the end where it ended."""
-        ended = not response.tokens or response.tokens[-1] == self.policy_end
+        ended = not response.tokens or response.tokens[-1] in self.ends
         if self.chat:  # first of all: a template reads the text, whatever was sampled
             return in_turns(self.tokenizer, response, ended)
-        sampled = self.policy_end is None
-        prompt = list((sampled and response.prompt_tokens) or self.tokenizer.encode(response.prompt))
-        # As sampled: text that is encoded anew can merge across the border, and its tokens are then others.
-        if sampled and response.tokens:
-            return [*prompt, *response.tokens]
-        end = end_token(self.tokenizer)
+        if self.opened is not None:
+            prompt = list(response.prompt_tokens or self.opened(response.prompt))
+            # As sampled: text that is encoded anew can merge across the border, and its tokens are then others.
+            said = response.tokens or self.tokenizer.encode(response.text, add_special_tokens=False)
+            return [*prompt, *said, *self.ends[:1] * (not response.tokens)]
+        prompt, end = self.tokenizer.encode(response.prompt), end_token(self.tokenizer)
         if self.pool == "last" and prompt[-1:] == [end]:  # some tokenizers end all that they encode
             prompt.pop()
         return [*prompt, *self.tokenizer.encode(response.text, add_special_tokens=False), *[end] * ended]
@@ -173,10 +176,10 @@ def _ready(model: Any, tokenizer: PreTrainedTokenizerBase, task: TextTask, pool:
         use_packed_attention(model)
     # Two tokenizers with one vocabulary read the same ids, so what was sampled need not be encoded again.
     same = tokenizer is task.tokenizer or tokenizer.get_vocab() == task.tokenizer.get_vocab()
-    policy_end = None if same and not chat else end_token(task.tokenizer)
+    opened = task.encode if same and not chat else None
     pool = pool if is_encoder(model) else "last"
     # Evaluation mode for good: dropout would give one response a different score in each pass.
-    return Backbone(model.eval(), tokenizer, policy_end, int(model.config.hidden_size), pool, chat=chat)
+    return Backbone(model.eval(), tokenizer, task.ends, opened, int(model.config.hidden_size), pool, chat=chat)
 
 
 def _after_padding(model: PreTrainedModel) -> list[int]:

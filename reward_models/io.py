@@ -10,6 +10,7 @@ import torch
 from transformers import AutoModelForSequenceClassification, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
+from prefrl.policies.language import merged_of
 from prefrl.policies.pretrained import load_tokenizer, load_weights, quiet
 from prefrl.protocols import TextTask
 from prefrl.reward_models.backbone import (
@@ -94,7 +95,7 @@ def save_classifier(backbone: Backbone, weight: torch.Tensor, constant: float, f
             "causal models, and encoders that came from a reward.checkpoint, are exported"
         )
     # A copy: the tokenizer that the fitted model reads with must not get a padding token, or lose its template.
-    tokenizer, model = copy.deepcopy(backbone.tokenizer), _without_adapters(backbone.model)
+    tokenizer, model = copy.deepcopy(backbone.tokenizer), merged_of(backbone.model)
     if not backbone.chat:
         tokenizer.chat_template = None
     if backbone.pool == "own":
@@ -106,14 +107,6 @@ def save_classifier(backbone: Backbone, weight: torch.Tensor, constant: float, f
         model.save_pretrained(work)
         tokenizer.save_pretrained(work)
     return constant
-
-
-def _without_adapters(model: PreTrainedModel) -> PreTrainedModel:
-    if not any("lora_" in name for name, _ in model.named_parameters()):
-        return model
-    from prefrl.reward_models.lora import merged  # peft takes seconds to load
-
-    return merged(model)
 
 
 def _classifier(backbone: PreTrainedModel, weight: torch.Tensor) -> PreTrainedModel:

@@ -99,9 +99,9 @@ class TransformerReward:
         self._fits, self._temperature = 0, 1.0
         backbone.model.requires_grad_(settings.train == "full")  # before adapters are added, which stay trainable
         if settings.train == "lora":
-            from prefrl.reward_models.lora import add_adapters  # peft takes seconds to load
+            from prefrl.policies.lora import add_adapters  # peft takes seconds to load
 
-            add_adapters(backbone.model, settings.lora_rank, settings.lora_targets, rng)
+            add_adapters(backbone.model, settings.lora_rank, settings.lora_targets, rng, "reward")
         self._trained = trainable(backbone, settings.train)
 
     @property
@@ -156,7 +156,10 @@ class TransformerReward:
         return found
 
     def score(self, candidates: Sequence[Response]) -> Floats:
-        return combine(self.member_scores(candidates), self._settings.combine, self._fits)
+        found = combine(self.member_scores(candidates), self._settings.combine, self._fits)
+        if np.isnan(found).any():  # which would say that there is no score
+            raise FloatingPointError("a learned reward is not finite; expected finite numbers: look at its last fit")
+        return found
 
     def features(self, candidates: Sequence[Response]) -> Floats:
         """(N, d): what the heads see, of a causal model its state at the last token."""

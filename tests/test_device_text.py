@@ -35,7 +35,7 @@ LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
 def task() -> Texts:
     """A Llama over bytes with random weights."""
     small = TextsSettings(layers=1, width=16, heads=2, response_tokens=3, context=64).build()
-    return replace(small, known=PROMPTS)
+    return replace(small, known={prompt: {} for prompt in PROMPTS}, learning=PROMPTS[3:], evaluating=PROMPTS[:3])
 
 
 def judged(count: int = 8) -> list[Judged[Response]]:
@@ -69,7 +69,7 @@ def encoder(task: Texts) -> TransformerReward:
     }
     torch.manual_seed(0)
     model: Any = BertModel(BertConfig(vocab_size=len(task.tokenizer), **size))
-    backbone = Backbone(model.eval(), task.tokenizer, None, 16, "mean")
+    backbone = Backbone(model.eval(), task.tokenizer, task.ends, task.encode, 16, "mean")
     return TransformerReward(TransformerSettings(), backbone, np.random.default_rng(0))
 
 

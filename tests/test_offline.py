@@ -155,7 +155,7 @@ def test_prompts_to_learn_on_and_to_evaluate_on_are_apart(tmp_path: Path, rng: n
     learn, evaluate = set(task.prompts(400, rng)), set(task.evaluation_prompts(400, rng))
     assert learn | evaluate == {f"p{i}" for i in range(64)}
     assert not learn & evaluate
-    with pytest.raises(ValueError, match=r"task\.prompts: 0 prompts leave none to learn on"):
+    with pytest.raises(ValueError, match=r"task\.prompts: there is no prompt to learn on"):
         small().build().prompts(1, rng)
 
 

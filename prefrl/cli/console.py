@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -61,6 +62,22 @@ def progress(loop: Loop, quiet: bool) -> Iterator[Progress]:
         begun = max(loop.round, 0)
         bar.add_task("run", total=total, completed=begun, begun=begun, spent=sum(loop.learner.steps))
         yield bar
+
+
+T = TypeVar("T")
+
+
+def counted(items: Iterable[T], total: int, noun: str) -> Iterator[T]:
+    """The same, with a bar on a terminal, and elsewhere a line at the end, both with a rate."""
+    begun = time.perf_counter()
+    columns = (TextColumn(f"{{task.completed}}/{{task.total}} {noun}"), BarColumn(24), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        row, done = bar.add_task(noun, total=total), 0
+        for done, item in enumerate(items, 1):
+            bar.update(row, completed=done)
+            yield item
+    seconds = time.perf_counter() - begun
+    say(f"{done} {noun} in {duration(seconds)}, {done / max(seconds, 1e-9):.2g} a second")
 
 
 class _TimeLeft(ProgressColumn):
@@ -138,7 +155,7 @@ def round_line(round: Round) -> Text:
     m = round.metrics
     parts = [
         Text(f"round {round.number:>3}", style="bold"),
-        Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue"),
+        *([] if math.isnan(m["evaluate/gold"]) else [Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue")]),
         Text(f"learned {m['evaluate/learned']:>8.3g}" if "evaluate/learned" in m else " " * 16, style="yellow"),
     ]
     for key, label, form in (

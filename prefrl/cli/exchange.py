@@ -40,6 +40,8 @@ class Form(StrEnum):
     minari = "minari"
     bundle = "bundle"
     classifier = "classifier"
+    policy = "policy"
+    adapter = "adapter"
 
 
 class Ties(StrEnum):
@@ -65,16 +67,16 @@ class Rows(StrEnum):
 @commands.command("export")
 def export_(
     store: Annotated[Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`.", exists=True)],
-    to: Annotated[Path, typer.Option(help="A folder for dataset, minari, bundle and classifier, else a file.")],
+    to: Annotated[Path, typer.Option(help="A folder for dataset, minari, bundle and models, else a file.")],
     form: Annotated[
-        Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a reward model.")
+        Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a model for transformers.")
     ] = Form.preferences,
     ties: Annotated[Ties, typer.Option(help="In the columns of TRL: leave ties out, or write them both ways.")] = (
         Ties.drop
     ),
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
-    """Write judgements, or a reward model of text, to files, and say what these could not hold."""
+    """Write judgements, a reward model of text or a policy to files, and say what these could not hold."""
     from prefrl.cli.console import say
 
     if to.is_file() and not force:
@@ -83,6 +85,13 @@ def export_(
         from prefrl.stages import export_classifier
 
         say(f"{to}: its logit, shifted by {export_classifier(store, to):+.6g}, is the mean of the reward's members")
+        return
+    if form in (Form.policy, Form.adapter):
+        from prefrl.stages import policy_of
+
+        policy_of(store).save(to, adapter=form is Form.adapter)
+        loads = "PeftModel.from_pretrained" if form is Form.adapter else "AutoModelForCausalLM.from_pretrained"
+        say(f"{to}: the newest policy, with its tokenizer; {loads} reads it")
         return
     from prefrl.exchange.ports import export
     from prefrl.store import Store

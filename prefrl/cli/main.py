@@ -194,6 +194,29 @@ def evaluate(
 
 
 @app.command()
+def generate(
+    folder: Folder,
+    prompts: Annotated[Path, typer.Option(help="A file or a data set with prompts or messages.", exists=True)],
+    to: Annotated[Path, typer.Option(help="JSON lines: the prompt, and the responses.")] = Path("responses.jsonl"),
+    samples: Annotated[int, typer.Option(help="Responses to each prompt.", min=1)] = 1,
+    temperature: Annotated[float, typer.Option(help="0 takes the most probable token.", min=0)] = 1.0,
+    top_k: Annotated[int, typer.Option(help="Draw among so many tokens; 0 for all.", min=0)] = 0,
+    top_p: Annotated[float, typer.Option(help="Draw among tokens of this share.", min=0, max=1)] = 1.0,
+) -> None:
+    """Have the newest policy of a text run answer prompts; `prefrl label --given` reads what is written."""
+    from prefrl import stages
+    from prefrl.cli.console import counted, say
+    from prefrl.envs.prompts import read_prompts
+    from prefrl.storage.files import write_file
+
+    drawn = stages.generate(folder, prompts, stages.Drawn(samples, temperature, top_k, top_p))
+    total = len(read_prompts(prompts))
+    rows = [{"prompt": prompt, "responses": found} for prompt, found in counted(drawn, total, "prompts")]
+    write_file(to, "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows).encode())
+    say(f"{len(rows)} prompts answered in {to}")
+
+
+@app.command()
 def report(folder: Folder) -> None:
     """Write a run's report.html again, also while it goes on."""
     from prefrl.cli.console import say

@@ -47,7 +47,7 @@ def responses(
     (tokens), ended (share), and fluency where the task can tell.
     """
     task = policy.task
-    drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, temperature=1.0)
+    drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, policy.sampling(1, temperature=1.0))
     found = policy.with_gold(drawn)
     gold = np.array([r.gold for r in found], float)
     metrics = {

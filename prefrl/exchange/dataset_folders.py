@@ -38,6 +38,11 @@ def _in_split(parse: Any, split: str) -> Sequence[Row | str]:
     return [row if isinstance(row, str) or row.split else row._replace(split=split) for row in found]
 
 
+def data_files(folder: Path) -> list[Path]:
+    """The files of a data set, in their order. Raises `ValueError` where there is none."""
+    return [path for path, _ in _files(folder)]
+
+
 def _files(folder: Path) -> Iterator[tuple[Path, str]]:
     """(file, split), those of the kind alone that the folder is made of."""
     refuse_links(folder)

@@ -18,8 +18,8 @@ from prefrl.components import Settings
 from prefrl.fit.pairs import Batch, batch
 from prefrl.improve.gradient import Parts, descend
 from prefrl.improve.objectives import dpo_loss
-from prefrl.improve.writer import Writer
-from prefrl.policies.language import Responses
+from prefrl.improve.writer import Targets, Writer
+from prefrl.policies.language import LanguagePolicy, Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device
 from prefrl.types import Evaluation, Integers, Metrics, Response, State, Steps
@@ -47,9 +47,16 @@ class DPOSettings(Settings):
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=2)
     """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
+    train: Literal["full", "lora"] = "full"
+    """What learning changes: everything, or low-rank adapters alone (LoRA), which take far less memory."""
+    lora_rank: int = Field(16, ge=1)
+    """The rank of the adapters."""
+    lora_targets: Targets = "all-linear"
+    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     discount: ClassVar[float] = 1.0  # a response is judged as a whole
+    temperature: ClassVar[float] = 1.0
 
     def shrunk(self) -> DPOSettings:
         return self.model_copy(update={"epochs": 1, "evaluation_prompts": 8})
@@ -58,7 +65,7 @@ class DPOSettings(Settings):
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
 
     def build(self, task: Task, rng: np.random.Generator) -> DPO:
-        return DPO(self, text(task, f"learner kind {self.kind!r} writes text"))
+        return DPO(self, text(task, f"learner kind {self.kind!r} writes text"), rng)
 
     def formula(self) -> str:
         wrong = f" + {self.label_smoothing:g} log s(-h)" if self.label_smoothing else ""
@@ -71,9 +78,13 @@ class DPOSettings(Settings):
 class DPO:
     """A `prefrl.protocols.Learner` of responses that reads the judgements in the store, and not the reward."""
 
-    def __init__(self, settings: DPOSettings, task: TextTask) -> None:
+    def __init__(self, settings: DPOSettings, task: TextTask, rng: np.random.Generator) -> None:
         self._settings = settings
-        self._writer = Writer(task, settings.learning_rate, 1.0, settings.chunk, settings.device)
+        self._writer = Writer(task, settings, rng)
+
+    @property
+    def policy(self) -> LanguagePolicy:
+        return self._writer.policy
 
     @property
     def steps(self) -> Steps:
@@ -89,7 +100,7 @@ class DPO:
         data, policy = batch(store.judged()), self._writer.policy
         if not len(data):
             raise ValueError("dpo learns from judged pairs; the store holds none: raise loop.labels, or import some")
-        rows = Responses.of(data.candidates, policy.task.tokenizer, policy.device)
+        rows = Responses.of(data.candidates, policy.task, policy.device)
         # (N,), once: the starting policy does not change. Padding is 0, so the sums are over the responses' own tokens.
         reference, seen = policy.start_logp(rows).sum(1), []
         for _ in range(self._settings.epochs):

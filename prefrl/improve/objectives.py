@@ -6,6 +6,7 @@ padding. REINFORCE, RLOO, GRPO and PPO are choices of baseline, advantage, clip 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -86,13 +87,16 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
     return out
 
 
+# A score that is NaN was not given: it counts in no baseline, and what has it gets advantage 0.
+
+
 def leave_one_out(scores: Tensor) -> Tensor:
     """(P, K) scores of K responses to each of P prompts, minus the mean of the other K - 1 (RLOO, Ahmadian 2024)."""
-    count = scores.shape[1]
-    if count < 2:
-        raise ValueError(f"leave-one-out needs at least 2 responses a prompt, got {count}")
+    if scores.shape[1] < 2:
+        raise ValueError(f"leave-one-out needs at least 2 responses a prompt, got {scores.shape[1]}")
+    count = _known(scores).sum(1, keepdim=True)
     # x_i - (sum - x_i) / (K - 1) = (x_i - mean) K / (K - 1): no sum over the others for each i.
-    return (scores - scores.mean(1, keepdim=True)) * (count / (count - 1))
+    return _centred(scores, 1) * (count / (count - 1).clamp(min=1))  # one alone has no others: it is centred to 0
 
 
 def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
@@ -102,10 +106,33 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
     """
     if scores.shape[1] < 2:
         raise ValueError(f"group normalisation needs at least 2 responses a prompt, got {scores.shape[1]}")
-    centred = scores - scores.mean(1, keepdim=True)
+    centred = _centred(scores, 1)
+    count = _known(scores).sum(1, keepdim=True)
+    std = (centred.square().sum(1, keepdim=True) / (count - 1).clamp(min=1)).sqrt()
     # The mean of equal numbers can differ from them in its last bit, which a std of 0 plus eps would blow up.
-    equal = (scores == scores[:, :1]).all(1, keepdim=True)
-    return torch.where(equal, 0.0, centred / (scores.std(1, keepdim=True) + eps))
+    return torch.where(all_equal(scores)[:, None], 0.0, centred / (std + eps))
+
+
+def batch_centred(scores: Tensor) -> Tensor:
+    """(P, K) scores minus the mean of all (REINFORCE with a constant baseline)."""
+    return _centred(scores, (0, 1))
+
+
+def all_equal(scores: Tensor) -> Tensor:
+    """(P,) whether the scores of a group, those that were given, do not differ."""
+    low, high = (torch.where(_known(scores), scores, x) for x in (math.inf, -math.inf))
+    return low.amin(1) >= high.amax(1)
+
+
+def _known(scores: Tensor) -> Tensor:
+    return ~scores.isnan()
+
+
+def _centred(scores: Tensor, over: int | tuple[int, int]) -> Tensor:
+    """Minus the mean of those that were given; 0 for the others."""
+    known = _known(scores)
+    total = torch.where(known, scores, 0.0).sum(over, keepdim=True)
+    return torch.where(known, scores - total / known.sum(over, keepdim=True).clamp(min=1), 0.0)
 
 
 # --- Losses, one number a step ----------------------------------------------------------------------------------

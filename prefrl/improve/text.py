@@ -7,6 +7,7 @@ k3 into the loss, whose gradient is that of the other direction.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import replace
 from typing import Any, Literal
@@ -21,13 +22,15 @@ from prefrl.improve.gradient import Batch, Objective, update
 from prefrl.improve.objectives import (
     AdaptiveKL,
     Reduction,
+    all_equal,
+    batch_centred,
     group_normalised,
     kl_k1,
     leave_one_out,
     masked_mean,
     step_rewards,
 )
-from prefrl.improve.writer import Writer
+from prefrl.improve.writer import Targets, Writer
 from prefrl.policies.language import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device, generator
@@ -39,6 +42,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "reinforce": {"advantage": "batch_mean"},
 }
 """Where their defaults are others than those of the fields below."""
+RATIO_TOLERANCE = {torch.float32: 0.01, torch.bfloat16: 1.0, torch.float16: 0.3}
+"""In half precision a decoding step rounds otherwise than a pass over all tokens."""
 
 
 class TextLearnerSettings(Settings):
@@ -81,12 +86,22 @@ class TextLearnerSettings(Settings):
     """Of sampling while learning and asking, and of every log-probability in the objective."""
     missing_end_penalty: float = Field(1.0, ge=0)
     """Taken off the score of a response that reached the task's most tokens without an end token."""
+    length_cost: float = 0.0
+    """Taken off the score for each token."""
+    reward_clip: float | None = Field(None, gt=0)
+    """A score is cut to this size, before anything is taken off it."""
     asked_responses: int = Field(4, ge=2)
     """Responses to each prompt that is sampled for being asked about."""
     evaluation_prompts: int = Field(128, ge=1)
     """Each gets one response at temperature 1."""
     chunk: int = Field(64, ge=1)
     """Rows in one pass of a network: changes memory and speed, and nothing else but rounding."""
+    train: Literal["full", "lora"] = "full"
+    """What learning changes: everything, or low-rank adapters alone (LoRA), which take far less memory."""
+    lora_rank: int = Field(16, ge=1)
+    """The rank of the adapters."""
+    lora_targets: Targets = "all-linear"
+    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
@@ -122,7 +137,7 @@ class TextLearnerSettings(Settings):
         return 1.0
 
     def build(self, task: Task, rng: np.random.Generator) -> TextLearner:
-        return TextLearner(self, text(task, f"learner kind {self.kind!r} writes text"))
+        return TextLearner(self, text(task, f"learner kind {self.kind!r} writes text"), rng)
 
     def formula(self) -> str:
         """The objective, as text."""
@@ -135,9 +150,9 @@ class TextLearner:
     Log-probabilities are kept from sampling, so the old policy is never run again.
     """
 
-    def __init__(self, settings: TextLearnerSettings, task: TextTask) -> None:
+    def __init__(self, settings: TextLearnerSettings, task: TextTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
-        self._writer = Writer(task, settings.learning_rate, settings.temperature, settings.chunk, settings.device)
+        self._writer = Writer(task, settings, rng)
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0
@@ -182,7 +197,8 @@ class TextLearner:
         settings = self._settings
         found = reward.score(drawn.candidates(self._task.tokenizer))  # (B,)
         raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
-        scores = self._finite("reward", raw - settings.missing_end_penalty * ~drawn.ended)
+        scored = ~raw.isnan()  # what a reward did not score teaches nothing
+        scores = self._finite("reward", self._shaped(raw, drawn))
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
@@ -193,24 +209,31 @@ class TextLearner:
         batch = Batch(drawn, drawn.logp, advantages, reference=reference)
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.chunk)
+        self._check_ratio(steps[0]["ratio_error"])
         # Per response, as the target is: a mean per token would be smaller by the length.
         sequence_kl = float(kl.sum(1).mean())
         if settings.kl_target is not None:
             self._kl = self._kl.update(sequence_kl, len(batch))
-        return (
-            steps[-1]
-            | {
-                "ratio_error": steps[0]["ratio_error"],
-                "reward": float(raw.mean()),
-                "reward_std": float(raw.std(correction=0)),
-                **({"kl": sequence_kl} if settings.beta else {}),  # what was not measured is absent, not 0
-                "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
-                "length": float(drawn.mask.sum(1).float().mean()),
-                "ended": float(drawn.ended.float().mean()),
-                "beta": self._kl.beta,
-                "equal_groups": float((groups == groups[:, :1]).all(1).float().mean()),
-            }
-        )
+        return steps[-1] | {
+            "ratio_error": steps[0]["ratio_error"],
+            "reward": float(raw.nanmean()),
+            "reward_std": float(raw[scored].std(correction=0)) if scored.any() else math.nan,
+            "unscored": 1.0 - float(scored.float().mean()),
+            **({"kl": sequence_kl} if settings.beta else {}),  # what was not measured is absent, not 0
+            "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
+            "length": float(drawn.mask.sum(1).float().mean()),
+            "ended": float(drawn.ended.float().mean()),
+            "beta": self._kl.beta,
+            "equal_groups": float(all_equal(scores.view_as(groups)).float().mean()),
+        }
+
+    def _check_ratio(self, error: float) -> None:
+        """Before a batch's first step the policy is the one that drew it: anything but rounding is a bug."""
+        if error > RATIO_TOLERANCE[self.policy.model.dtype]:
+            raise FloatingPointError(
+                f"update {self._updates}: the policy gives its own samples other probabilities than it drew them with "
+                f"(ratio off by {error:.2g}); set task.dtype=float32, and report it if that does not help"
+            )
 
     def _objective(self) -> Objective:
         """What a gradient step minimises."""
@@ -230,8 +253,14 @@ class TextLearner:
         orders = [torch.randperm(size, generator=order).to(self.policy.device) for _ in range(self._settings.epochs)]
         return [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
 
+    def _shaped(self, raw: Tensor, drawn: Responses) -> Tensor:
+        """(B,): the scores that are learned from, NaN where there is none."""
+        settings = self._settings
+        kept = raw if settings.reward_clip is None else raw.clamp(-settings.reward_clip, settings.reward_clip)
+        return kept - settings.missing_end_penalty * ~drawn.ended - settings.length_cost * drawn.mask.sum(1)
+
     def _finite(self, name: str, values: Tensor) -> Tensor:
-        if not values.isfinite().all():
+        if values.isinf().any():
             raise FloatingPointError(
                 f"the {name} of update {self._updates} is not finite: {values.detach().flatten()[:4].tolist()}; "
                 "expected finite numbers: look at the reward model's last fit"
@@ -243,7 +272,7 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
     """(P, K) returns of K responses to each of P prompts -> (P, K) advantages."""
     if how == "leave_one_out":
         return leave_one_out(returns)
-    return group_normalised(returns) if how == "group_normalised" else returns - returns.mean()
+    return group_normalised(returns) if how == "group_normalised" else batch_centred(returns)
 
 
 AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}

@@ -31,6 +31,11 @@ class Sampling:
     ends: tuple[int, ...]
     """The tokens that end a response; none for a fixed length."""
     temperature: float = 1.0
+    """0 takes the most probable token."""
+    top_k: int = 0
+    """Draw among the most probable tokens alone; 0 for all. Not for learning: a policy's samples must be its own."""
+    top_p: float = 1.0
+    """Draw among the most probable tokens that hold this much of the probability (Holtzman et al. 2020)."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +153,7 @@ def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: tor
     ended = torch.zeros(rows, dtype=torch.bool, device=logits.device)
     live = torch.arange(rows, device=logits.device)
     for t in range(length):
-        drawn, drawn_logp = draw(logits, uniform[live, t], sampling.temperature)
+        drawn, drawn_logp = draw(_narrowed(logits, sampling), uniform[live, t], sampling.temperature or 1.0)
         going = ~ended[live]  # ended rows that are still in the batch draw on, into padding
         tokens[live, t], logp[live, t], mask[live, t] = drawn * going, drawn_logp * going, going
         # Only after the mask was written: an end token is a real one.
@@ -162,6 +167,22 @@ def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: tor
             live, drawn = live[kept], drawn[kept]  # `kept` counts within the batch, `live` within the result
         logits = decoder.step(drawn)
     return Generation(tokens, mask, logp, ended)
+
+
+def _narrowed(logits: Tensor, sampling: Sampling) -> Tensor:
+    """(B, V) logits with minus infinity for what is not to be drawn."""
+    if sampling.temperature == 0:
+        return torch.full_like(logits, -torch.inf).scatter_(1, logits.argmax(1, keepdim=True), 0.0)
+    if sampling.top_k:
+        least = logits.topk(min(sampling.top_k, logits.shape[1])).values[:, -1:]
+        logits = logits.masked_fill(logits < least, -torch.inf)
+    if sampling.top_p < 1:
+        ordered, order = (logits.float() / sampling.temperature).sort(1, descending=True)
+        share = ordered.softmax(1)
+        # What stands before a token must leave room for it: the most probable one always stays.
+        gone = share.cumsum(1) - share >= sampling.top_p
+        logits = logits.masked_fill(gone.scatter(1, order, gone), -torch.inf)
+    return logits
 
 
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> tuple[Tensor, Tensor]:

@@ -4,17 +4,22 @@ encoded again in between."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
-from prefrl.components import ConfigError
+from prefrl.policies.exact import check_exact, rows_of_embedding
 from prefrl.policies.generate import Sampling, generate
+from prefrl.policies.pretrained import quiet
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator
+from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
 
 
@@ -60,19 +65,17 @@ class Responses:
             yield at, self.rows(at)
 
     @classmethod
-    def of(
-        cls, candidates: Sequence[Response], tokenizer: PreTrainedTokenizerBase, device: torch.device | None = None
-    ) -> Responses:
+    def of(cls, candidates: Sequence[Response], task: TextTask, device: torch.device | None = None) -> Responses:
         """Responses that were sampled as they were; those that came as text alone are encoded, an end token added."""
-        ends, pairs = int(tokenizer.eos_token_id), []
+        pairs = []
         for one in candidates:
             # Text that is encoded anew can merge across the border, into tokens that nobody sampled.
-            prompt = one.prompt_tokens or tuple(tokenizer.encode(one.prompt))
-            tokens = one.tokens or (*tokenizer.encode(one.text, add_special_tokens=False), ends)
+            prompt = one.prompt_tokens or task.encode(one.prompt)
+            tokens = one.tokens or (*task.tokenizer.encode(one.text, add_special_tokens=False), task.ends[0])
             pairs.append((prompt, tokens))
         padded, lengths = pad_right([tokens for _, tokens in pairs], device)
         mask = torch.arange(padded.shape[1], device=device) < lengths[:, None]
-        ended = torch.tensor([tokens[-1] == ends for _, tokens in pairs], device=device)
+        ended = torch.tensor([tokens[-1] in task.ends for _, tokens in pairs], device=device)
         # a mask is filled row by row
         texts, unknown = tuple(one.prompt for one in candidates), torch.zeros(mask.shape, device=device)
         return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, unknown, ended)
@@ -87,18 +90,42 @@ class Responses:
         return found
 
 
+class Lora(NamedTuple):
+    """What is trained in place of a model's own weights."""
+
+    rank: int
+    targets: str
+
+
 class LanguagePolicy:
     """A `prefrl.protocols.Policy` of `Responses`: a causal language model beside the one that it started from.
 
     Both stay in evaluation mode throughout, so the probability ratio is 1 (to rounding) before a batch's first step.
     `temperature` is that of sampling and of every log-probability, unless another is asked for; at most `part` rows go
-    through a network at once. Raises `ConfigError` for models whose logits are more than their head says.
+    through a network at once. With `lora` its adapters alone are trained (their start is drawn from `rng`), and the
+    model without them is the one that it started from. Raises `ConfigError` for models that are not what is computed
+    here, see `exact`.
     """
 
-    def __init__(self, task: TextTask, temperature: float, part: int) -> None:
+    def __init__(
+        self,
+        task: TextTask,
+        temperature: float,
+        part: int,
+        lora: Lora | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> None:
         self.task, self.temperature, self.part = task, temperature, part
-        self.model, self.start = task.model(), task.model().requires_grad_(False)  # two copies of the weights
-        check_head(self.model)
+        self.model = task.model()
+        self._head_alone = head_alone(self.model)
+        check_exact(self.model, self._probe)
+        if lora is None:
+            self.start = task.model().requires_grad_(False)  # a second copy of the weights
+            return
+        from prefrl.policies.lora import add_adapters  # peft takes seconds to load
+
+        add_adapters(self.model, lora.rank, lora.targets, rng or np.random.default_rng(0), "learner")
+        self.start = self.model
 
     @property
     def device(self) -> torch.device:
@@ -110,32 +137,39 @@ class LanguagePolicy:
             model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
 
     def parameters(self) -> list[torch.nn.Parameter]:
-        return list(self.model.parameters())
+        return list(self._trained().values())
 
     def log_prob(self, inputs: Responses) -> tuple[Tensor, None]:
-        return response_logp(self.model, inputs, self.temperature), None
+        return response_logp(self.model, inputs, self.temperature, self._head_alone), None
 
     def values(self, inputs: Responses) -> Tensor:
         raise ValueError("a language model without a critic has no values: set the weight of the critic's loss to 0")
 
     def respond(
-        self, prompts: Sequence[str], samples: int, rng: np.random.Generator, temperature: float | None = None
+        self, prompts: Sequence[str], samples: int, rng: np.random.Generator, sampling: Sampling | None = None
     ) -> Responses:
-        """Sample K responses to each prompt; prompts are encoded here, once, with the tokenizer's own begin token."""
-        tokenizer = self.task.tokenizer
-        encoded = [tuple(tokenizer.encode(prompt)) for prompt in prompts]
-        ends, temperature = (int(tokenizer.eos_token_id),), self.temperature if temperature is None else temperature
-        sampling = Sampling(samples, self.task.response_tokens, ends, temperature)
+        """Sample K responses to each prompt; prompts are encoded here, once, as the task says.
+
+        `sampling`: otherwise than by the policy's own temperature.
+        """
+        encoded = [self.task.encode(prompt) for prompt in prompts]
+        sampling = sampling or self.sampling(samples)
         drawn = generate(self.model, encoded, sampling, generator(rng))
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
         return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
 
+    def sampling(self, samples: int, temperature: float | None = None) -> Sampling:
+        """How the raw policy draws K responses to a prompt, at its own temperature unless another is given."""
+        temperature = self.temperature if temperature is None else temperature
+        return Sampling(samples, self.task.response_tokens, self.task.ends, temperature)
+
     def start_logp(self, responses: Responses, temperature: float | None = None) -> Tensor:
         """(B, L) log-probabilities under the starting policy, without gradients."""
         temperature = self.temperature if temperature is None else temperature
-        return all_logp(self.start, responses, temperature, self.part)
+        with self._at_the_start():
+            return all_logp(self.start, responses, temperature, self.part, self._head_alone)
 
     def with_gold(self, responses: Responses) -> list[Response]:
         """As candidates, gold attached: for what is asked about, and for evaluation."""
@@ -143,25 +177,44 @@ class LanguagePolicy:
         gold = self.task.gold(found)
         return [replace(r, gold=gold[i : i + 1]) for i, r in enumerate(found)]
 
+    def save(self, folder: Path, adapter: bool = False) -> None:
+        """Write what transformers' `from_pretrained` loads: the whole model, or its adapters alone for peft's."""
+        save_model(self.model, self.task, folder, adapter)
+
     def state(self) -> State:
-        # Tied weights have one name here, and are saved once.
-        return {name: p.detach().clone() for name, p in self.model.named_parameters()}
+        """What learning changes."""
+        return {name: p.detach().clone() for name, p in self._trained().items()}
 
     @torch.no_grad()
     def load(self, state: State) -> None:
         """Raises ValueError where names or shapes differ."""
-        for name, parameter in self.model.named_parameters():
+        for name, parameter in self._trained().items():
             found = state.get(name)
             if found is None or found.shape != parameter.shape:
                 raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
             parameter.copy_(found)  # in place: the optimiser holds these very tensors
 
+    def _trained(self) -> dict[str, torch.nn.Parameter]:
+        """By name. Tied weights have one name here."""
+        return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
 
-def response_logp(model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
+    def _at_the_start(self) -> AbstractContextManager[None]:
+        if self.start is not self.model:
+            return nullcontext()
+        from prefrl.policies.lora import without_adapters
+
+        return without_adapters(self.model)
+
+    def _probe(self, prompts: Sequence[Sequence[int]], tokens: Tensor, mask: Tensor) -> Tensor:
+        rows = Responses(("",) * len(prompts), tuple(map(tuple, prompts)), tokens, mask, mask.float(), mask[:, -1])
+        return response_logp(self.model, rows, 1.0, self._head_alone)
+
+
+def response_logp(model: PreTrainedModel, responses: Responses, temperature: float, head_alone: bool = True) -> Tensor:
     """(B, L) float32 log-probabilities of the responses' tokens, differentiable; 0 on padding.
 
     Rows are padded on the right, where a causal model never looks: no attention mask and no position ids are needed.
-    The head runs on the real tokens of the responses only.
+    Where the logits are the head's output alone, it runs on the real tokens of the responses only.
     """
     rows, steps = responses.mask.nonzero(as_tuple=True)  # (n,), (n,): the n real tokens, row by row
     prompts, lengths = pad_right(responses.prompt_tokens, responses.mask.device)
@@ -170,19 +223,27 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
     ids[:, : prompts.shape[1]] = prompts
     chosen = responses.tokens[rows, steps]
     ids[rows, places] = chosen
-    hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
-    logits = head_logits(model, hidden[rows, places - 1])  # (n, V): the state before a token predicts it
+    if head_alone:
+        hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
+        logits = head_logits(model, hidden[rows, places - 1])  # (n, V): the state before a token predicts it
+    else:
+        first = int(lengths.min()) - 1  # the first column whose logits are wanted
+        kept = model(input_ids=ids, use_cache=False, logits_to_keep=ids.shape[1] - first).logits
+        logits = kept[rows, places - 1 - first]
     # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
     found = -torch.nn.functional.cross_entropy(logits.float() / temperature, chosen, reduction="none")
     return found.new_zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
 
 
 @torch.no_grad()
-def all_logp(model: PreTrainedModel, responses: Responses, temperature: float, part: int) -> Tensor:
+def all_logp(
+    model: PreTrainedModel, responses: Responses, temperature: float, part: int, head_alone: bool = True
+) -> Tensor:
     """`response_logp` without gradients, a part of the rows at a time."""
     found = torch.zeros(responses.mask.shape, device=responses.mask.device)
     for at, rows in responses.parts(part):
-        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature)  # a part is cut to its longest row
+        # a part is cut to its longest row
+        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, head_alone)
     return found
 
 
@@ -194,13 +255,37 @@ def head_logits(model: PreTrainedModel, hidden: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def check_head(model: PreTrainedModel) -> None:
-    """Raise `ConfigError` for models whose logits are more than their head's output (soft caps, scales)."""
-    ids = torch.zeros(1, 4, dtype=torch.int64)
+def head_alone(model: PreTrainedModel) -> bool:
+    """Whether a model's logits are its head's output, and nothing is done to them (soft caps, scales)."""
+    ids = torch.arange(8, device=model.device)[None] * 7919 % rows_of_embedding(model)  # tokens that are far apart
     direct = model(input_ids=ids, use_cache=False).logits
     ours = head_logits(model, model.base_model(input_ids=ids, use_cache=False).last_hidden_state)
-    if not torch.allclose(direct, ours, atol=1e-4, rtol=1e-4):
-        raise ConfigError(f"{type(model).__name__} does more to its logits than its head says; this is not supported")
+    # Hardly a cap shows on small logits: the bits must be the same, or nearly.
+    return bool((direct - ours).abs().max() <= 1e-6 * direct.abs().max())
+
+
+def save_model(model: PreTrainedModel, task: TextTask, folder: Path, adapter: bool) -> None:
+    """Write a model, or its adapters alone, with its tokenizer and what ends its responses."""
+    with whole_folder(folder) as work, quiet():
+        if adapter:
+            from prefrl.policies.lora import save_adapters
+
+            save_adapters(model, work)
+        else:
+            whole = merged_of(model)
+            if whole.generation_config is not None:
+                whole.generation_config.eos_token_id = list(task.ends)
+            whole.save_pretrained(work)
+        task.tokenizer.save_pretrained(work)
+
+
+def merged_of(model: PreTrainedModel) -> PreTrainedModel:
+    """The model itself, or a copy that its adapters are added to."""
+    if not any("lora_" in name for name, _ in model.named_parameters()):
+        return model
+    from prefrl.policies.lora import merged  # peft takes seconds to load
+
+    return merged(model)
 
 
 def pad_right(rows: Sequence[Sequence[int]], device: torch.device | None = None) -> tuple[Tensor, Tensor]:

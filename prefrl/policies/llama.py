@@ -87,12 +87,22 @@ class _Layer:
 
     def __init__(self, layer: Any) -> None:
         attention, mlp = layer.self_attn, layer.mlp
-        q = attention.q_proj.weight * attention.scaling
-        qkv = torch.cat([q, attention.k_proj.weight, attention.v_proj.weight])
+        q = matrix(attention.q_proj) * attention.scaling
+        qkv = torch.cat([q, matrix(attention.k_proj), matrix(attention.v_proj)])
         self.qkv = qkv * layer.input_layernorm.weight  # scales columns: W (n x) = (W n) x
-        self.out = attention.o_proj.weight
-        self.gate_up = torch.cat([mlp.gate_proj.weight, mlp.up_proj.weight]) * layer.post_attention_layernorm.weight
-        self.down = mlp.down_proj.weight
+        self.out = matrix(attention.o_proj)
+        gate_up = torch.cat([matrix(mlp.gate_proj), matrix(mlp.up_proj)])
+        self.gate_up = gate_up * layer.post_attention_layernorm.weight
+        self.down = matrix(mlp.down_proj)
+
+
+def matrix(layer: Any) -> Tensor:
+    """(out, in): what a linear layer multiplies by, the products of its adapters added."""
+    if isinstance(layer, torch.nn.Linear):
+        return layer.weight
+    active = () if layer.disable_adapters else layer.active_adapters  # peft's layer around a linear one
+    found: Tensor = layer.get_base_layer().weight + sum(layer.get_delta_weight(name) for name in active)
+    return found
 
 
 def _normed(x: Tensor, eps: float) -> Tensor:

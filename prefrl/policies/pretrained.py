@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import torch
 from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
@@ -20,17 +20,21 @@ from transformers.utils.logging import (
 
 from prefrl.components import ConfigError
 
+Precision: TypeAlias = Literal["float32", "bfloat16"]
 
-def load_weights(auto: Any, name: str | Path, download: bool, switch: str = "") -> PreTrainedModel:
-    """A model of a transformers class, in float32, dropout off. Raises `ConfigError` where weights are missing.
 
-    `download`: whether a name may be looked up on the Hub; `switch`: the setting that allows it, for the advice.
+def load_weights(
+    auto: Any, name: str | Path, download: bool, switch: str = "", dtype: Precision = "float32"
+) -> PreTrainedModel:
+    """A model of a transformers class, dropout off. Raises `ConfigError` where weights are missing.
+
+    A path to a .gguf file is one that transformers unpacks. `download`: whether a name may be looked up on the Hub;
+    `switch`: the setting that allows it, for the advice.
     """
-    where = {"local_files_only": not download, "trust_remote_code": False}
     try:
         with quiet():
             model, info = auto.from_pretrained(
-                name, dtype=torch.float32, use_safetensors=True, output_loading_info=True, **where
+                dtype=getattr(torch, dtype), use_safetensors=True, output_loading_info=True, **_where(name, download)
             )
     except (OSError, ValueError) as error:
         local = switch and not download
@@ -47,12 +51,19 @@ def load_weights(auto: Any, name: str | Path, download: bool, switch: str = "") 
 def load_tokenizer(name: str | Path, download: bool) -> PreTrainedTokenizerBase:
     """The tokenizer beside a model. Raises `ConfigError` where there is none."""
     try:
-        found: PreTrainedTokenizerBase = AutoTokenizer.from_pretrained(
-            name, local_files_only=not download, trust_remote_code=False
-        )
+        with quiet():
+            found: PreTrainedTokenizerBase = AutoTokenizer.from_pretrained(**_where(name, download))
     except (OSError, ValueError) as error:
         raise ConfigError(f"no tokenizer could be read from {str(name)!r}: {first_line(error)}") from error
     return found
+
+
+def _where(name: str | Path, download: bool) -> dict[str, Any]:
+    """Where to look, and that no code is run from there."""
+    path, safe = Path(name), {"local_files_only": not download, "trust_remote_code": False}
+    if path.suffix == ".gguf" and path.is_file():
+        return {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name, **safe}
+    return {"pretrained_model_name_or_path": name, **safe}
 
 
 def first_line(error: Exception) -> str:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
 from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
-from prefrl.policies.language import Responses, check_head
+from prefrl.policies.language import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
 
@@ -63,6 +63,7 @@ VARIANTS: list[dict[str, object]] = [
         "epochs": 2,
         "minibatches": 2,
         "kl_in": "loss",
+        "beta": 0.1,
     },
     {"advantage": "batch_mean", "reduction": "token", "temperature": 0.8, "kl_target": 3.0},
 ]
@@ -122,7 +123,7 @@ class _WithoutGold:
         self.name, self.kind = task.name, task.kind
         self.tokenizer, self.response_tokens = task.tokenizer, task.response_tokens
         self.model, self.prompts, self.evaluation_prompts = task.model, task.prompts, task.evaluation_prompts
-        self.fluency = task.fluency
+        self.fluency, self.encode, self.ends = task.fluency, task.encode, task.ends
 
     def gold(self, responses: Sequence[Response]) -> Floats:
         return np.full(len(responses), np.nan, np.float32)
@@ -245,10 +246,51 @@ def test_no_dropout_and_no_training_mode(toy_reviews: Reviews) -> None:
     assert not any(m.training for m in [*one.policy.model.modules(), *one.policy.start.modules()])
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Reviews, bad: float) -> None:
+def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Reviews) -> None:
     with pytest.raises(FloatingPointError, match=r"the reward of update 0 is not finite"):
-        learner(toy_reviews).improve(reward(constant=bad), NO_STORE, np.random.default_rng(0))
+        learner(toy_reviews).improve(reward(constant=float("inf")), NO_STORE, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_mean"])
+def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
+    """As if it had never been drawn: the others learn from one another alone."""
+
+    class Some:
+        unscored = 4.0
+
+        def score(self, candidates: Sequence[Response]) -> Floats:
+            return np.array([i if i % 4 else self.unscored for i in range(len(candidates))], np.float32)
+
+    likes, found, steps = Some(), [], []
+    for likes.unscored in (float("nan"), float("nan"), 4.0):
+        one = learner(toy_reviews, beta=0.0, missing_end_penalty=0.0, advantage=advantage)
+        steps.append(one.improve(cast("RewardModel[Response]", likes), NO_STORE, np.random.default_rng(0)))
+        found.append(flat(one.policy.model))
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
+    assert (steps[0]["unscored"], steps[2]["unscored"]) == (0.25, 0.0)
+    likes.unscored, nobody = float("nan"), learner(toy_reviews, beta=0.0, advantage=advantage)
+    before = flat(nobody.policy.model)
+    metrics = nobody.improve(reward(constant=float("nan")), NO_STORE, np.random.default_rng(0))
+    assert torch.equal(before, flat(nobody.policy.model))
+    assert metrics["unscored"] == 1.0
+
+
+def test_a_score_is_cut_before_anything_is_taken_off_it(toy_reviews: Reviews) -> None:
+    """With equal scores after the cut, only the length is left to learn from."""
+
+    class Wild:
+        def score(self, candidates: Sequence[Response]) -> Floats:
+            return np.array([100.0 + i for i in range(len(candidates))], np.float32)
+
+    changes: dict[str, object] = {"beta": 0.0, "missing_end_penalty": 0.0, "reward_clip": 1.0}
+    still, shorter = learner(toy_reviews, **changes), learner(toy_reviews, **changes, length_cost=0.1)
+    before = flat(still.policy.model)
+    for one in (still, shorter):
+        metrics = one.improve(cast("RewardModel[Response]", Wild()), NO_STORE, np.random.default_rng(0))
+    assert torch.equal(before, flat(still.policy.model))
+    assert not torch.equal(before, flat(shorter.policy.model))
+    assert metrics["reward"] > 100.0  # said as it was given
 
 
 @pytest.mark.parametrize(
@@ -279,21 +321,6 @@ def test_a_state_of_another_size_is_refused(toy_reviews: Reviews) -> None:
     state["model"] = {name: p[..., :1] for name, p in state["model"].items()}
     with pytest.raises(ValueError, match="other settings"):
         one.load(state)
-
-
-def test_a_model_that_does_more_than_its_head_is_refused(toy_reviews: Reviews) -> None:
-    model = toy_reviews.model()
-    head = model.lm_head
-    model.lm_head = torch.nn.Sequential(head, torch.nn.Tanh())
-    check_head(model)
-    model.register_forward_hook(lambda _, args, out: replace_logits(out))
-    with pytest.raises(ConfigError, match="not supported"):
-        check_head(model)
-
-
-def replace_logits(out: Any) -> Any:
-    out["logits"] = out["logits"] * 2 + 1
-    return out
 
 
 def test_rows_and_parts_keep_what_belongs_together() -> None:

@@ -15,7 +15,7 @@ from prefrl.policies.language import LanguagePolicy, Responses
 def test_sampled_responses_come_back_token_for_token(toy_reviews: Reviews, rng: np.random.Generator) -> None:
     policy = LanguagePolicy(toy_reviews, temperature=1.0, part=5)
     drawn = policy.respond(toy_reviews.prompts(3, rng), 4, rng)
-    again = Responses.of(policy.with_gold(drawn), toy_reviews.tokenizer)
+    again = Responses.of(policy.with_gold(drawn), toy_reviews)
     assert torch.equal(again.mask, drawn.mask)
     assert torch.equal(again.tokens * again.mask, drawn.tokens * drawn.mask)
     assert torch.equal(again.ended, drawn.ended)
@@ -32,7 +32,7 @@ def test_responses_that_came_as_text_get_a_begin_and_an_end_token_once(
     policy, tokenizer = LanguagePolicy(toy_reviews, temperature=1.0, part=5), toy_reviews.tokenizer
     drawn = [r for r in policy.with_gold(policy.respond(toy_reviews.prompts(2, rng), 4, rng)) if r.tokens[-1] == 2]
     texts = [replace(one, tokens=(), prompt_tokens=()) for one in drawn]
-    found = Responses.of(texts, tokenizer)
+    found = Responses.of(texts, toy_reviews)
     assert found.ended.all()
     for i, one in enumerate(drawn):
         assert found.prompt_tokens[i] == one.prompt_tokens
