@@ -114,6 +114,8 @@ class Config(Settings):
         task = self.build_task()
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
+        if self.loop.labels and reward.fitted and not trainable(reward):
+            raise ConfigError(f"loop.labels={self.loop.labels}, but this reward is not fitted: set loop.labels=0")
         return Loop(
             task=task,
             learner=learner,

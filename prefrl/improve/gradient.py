@@ -1,8 +1,8 @@
 """The one update that every policy gradient here makes: gradient steps on a batch that was sampled before.
 
-Variant: PPO's surrogate (Schulman et al. 2017) or the plain policy gradient; a critic, an entropy bonus and a KL to a
-reference are terms beside it. Each term is averaged over the whole minibatch, however many parts it goes through the
-network in. It sees a policy and a batch, and nothing of the world that they come from.
+Variant: PPO's surrogate (Schulman et al. 2017) or the plain policy gradient; a critic and an entropy bonus are terms
+beside it, and a KL to a reference is part of the advantages. Each term is averaged over the whole minibatch, however
+many parts it goes through the network in. It sees a policy and a batch, and nothing of the world that they come from.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from prefrl.improve.objectives import (
     Reduction,
     clipped_surrogate,
     kl_k3,
-    kl_loss,
     log_ratio,
     masked_sum,
     policy_gradient,
@@ -45,8 +44,6 @@ class Objective:
     """Weight of the critic's loss."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
-    beta: float = 0.0
-    """Weight of the KL of whole sequences to the reference, as a loss."""
     reduction: Reduction = "token"
     """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
     max_grad_norm: float = math.inf
@@ -65,8 +62,6 @@ class Batch(Generic[I]):
     """(B, L), or (B, 1) where all steps of a sequence have the same."""
     returns: Tensor | None = None
     """(B, L) the critic's targets."""
-    reference: Tensor | None = None
-    """(B, L) log-probabilities under the reference policy."""
 
     def __len__(self) -> int:
         return len(self.logp)
@@ -80,7 +75,7 @@ class Batch(Generic[I]):
             return None if steps is None else steps[at, :width]
 
         advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
-        return Batch(inputs, logp, advantages, cut(self.returns), cut(self.reference))
+        return Batch(inputs, logp, advantages, cut(self.returns))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
         """Parts of at most `size` sequences of like length, so that little padding is computed on; all at once for
@@ -192,9 +187,6 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
         gain = policy_gradient(logp, batch.advantages)
     else:
         gain = clipped_surrogate(ratios, batch.advantages, objective.clip)
-    if objective.beta:
-        assert batch.reference is not None
-        gain = gain + objective.beta * kl_loss(ratios, logp, batch.reference, batch.inputs.mask)
     return gain
 
 

@@ -175,26 +175,14 @@ def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
 
 
 # --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------
-# With d = log pi(a) - log ref(a). As a number k1 and k3 are unbiased. As a loss neither will do: k1's gradient is 0 in
-# expectation and k3's is that of the other direction, KL(ref || pi); d^2 / 2 of each step by itself (k2) does not
-# charge a choice for the KL of the steps that it leads to.
+# With d = log pi(a) - log ref(a). As a number k1 and k3 are unbiased. As a loss none will do: k1's gradient is 0 in
+# expectation, k3's is that of the other direction, KL(ref || pi), and d^2 / 2 of each step by itself (k2) does not
+# charge a choice for the KL of the steps that it leads to. So k1, summed over a sequence, is a cost like any other.
 
 
 def kl_k1(logp: Tensor, ref_logp: Tensor) -> Tensor:
     """d: unbiased, can be negative, high variance. For use in the reward."""
     return logp - ref_logp
-
-
-def kl_loss(log_ratios: Tensor, logp: Tensor, ref_logp: Tensor, mask: Tensor) -> Tensor:
-    """(B, L): adds up to k1 of each sequence as a number, and to the gradient of the KL of whole sequences as a loss.
-
-    A choice is charged for its own d and for all that come after it, which it leads to; the score-function gradient
-    with the KL in place of a reward to go. `log_ratios` (to the policy that drew the steps) weigh it, as in PPO.
-    """
-    d = torch.where(mask.bool(), logp - ref_logp, 0.0).detach()
-    to_go = d.flip(1).cumsum(1).flip(1)
-    ratio = log_ratios.exp()
-    return d + to_go * (ratio - ratio.detach())  # the difference is 0, and its gradient that of log pi at ratio 1
 
 
 def kl_k3(logp: Tensor, ref_logp: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE.
 
-Variant: one advantage a response, no critic; the KL of each token is taken off the reward before the baseline (k1), or
-its gradient is added to the loss's; the penalty for a missing end comes before the baseline too. GRPO as published puts
-k3 into the loss, whose gradient is that of the other direction.
+Variant: one advantage a response, no critic; the KL of a response (k1, summed over its tokens) is taken off the reward
+before the baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the
+baseline too. GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from prefrl.types import Evaluation, Metrics, Response, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "rloo": {},
-    "grpo": {"advantage": "group_normalised", "clip": 0.2, "kl_in": "loss", "reduction": "sequence"},
+    "grpo": {"advantage": "group_normalised", "clip": 0.2, "kl_in": "advantage", "reduction": "sequence"},
     "reinforce": {"advantage": "batch_mean"},
 }
 """Where their defaults are others than those of the fields below."""
@@ -51,7 +51,7 @@ class TextLearnerSettings(Settings):
 
     kind: Literal["text"] = "text"
     algorithm: Literal["rloo", "grpo", "reinforce"] = "rloo"
-    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with the KL's own gradient), or
+    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with another KL, see below), or
     reinforce (Williams 1992) with the batch's mean as its baseline. Anything that is set beside it stands."""
     updates: int = Field(15, ge=1)
     """Batches of a round."""
@@ -70,8 +70,8 @@ class TextLearnerSettings(Settings):
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
     beta: float = Field(0.3, ge=0)
     """Weight of the KL to the starting policy, in units of reward a nat."""
-    kl_in: Literal["reward", "loss"] = "reward"
-    """Where the KL goes: into the reward (k1 of each token, before the baseline), or into the loss."""
+    kl_in: Literal["reward", "advantage"] = "reward"
+    """Where the KL is taken off: the reward, before the baseline, or the advantage, after it was normalised."""
     kl_target: float | None = Field(None, gt=0)
     """Steer beta to this KL in nats per response (Ziegler et al. 2019); null leaves it alone."""
     kl_horizon: float = Field(10_000.0, gt=0)
@@ -205,8 +205,8 @@ class TextLearner:
         # (B,): one return a response, so the KL is in it before the baseline is taken off.
         returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
         groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
-        advantages = advantages_of(groups, settings.advantage).view(-1, 1)  # (B, 1): the same for all tokens
-        batch = Batch(drawn, drawn.logp, advantages, reference=reference)
+        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kl)
+        batch = Batch(drawn, drawn.logp, advantages.view(-1, 1))  # (B, 1): the same for all tokens
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.chunk)
         self._check_ratio(steps[0]["ratio_error"])
@@ -238,10 +238,18 @@ class TextLearner:
     def _objective(self) -> Objective:
         """What a gradient step minimises."""
         settings = self._settings
-        beta = self._kl.beta if settings.kl_in == "loss" else 0.0
-        return Objective(
-            clip=settings.clip, beta=beta, reduction=settings.reduction, max_grad_norm=settings.max_grad_norm
-        )
+        return Objective(clip=settings.clip, reduction=settings.reduction, max_grad_norm=settings.max_grad_norm)
+
+    def _kl_advantages(self, kl: Tensor) -> Tensor | float:
+        """(P, K): what the KL (B, L) takes off the advantages of responses, where it is not in the reward.
+
+        With the same baseline, so that at the optimum of reward minus beta x KL both cancel in each sample.
+        """
+        settings = self._settings
+        if settings.kl_in == "reward" or not settings.beta:
+            return 0.0
+        baseline = "batch_mean" if settings.advantage == "batch_mean" else "leave_one_out"
+        return self._kl.beta * advantages_of(kl.sum(1).view(-1, settings.responses), baseline)
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
         """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
@@ -289,12 +297,14 @@ def text_formula(settings: TextLearnerSettings) -> str:
     if settings.clip is not None:
         gain = f"min(r A_i, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) A_i)"
     kl = f"{settings.beta:g}" + (f" (steered to {settings.kl_target:g} nats)" if settings.kl_target else "")
-    in_loss = f" - {kl} KL[pi(y), ref(y)]" if settings.beta and settings.kl_in == "loss" else ""
-    in_reward = f" - {kl} sum_t [log pi_old(y_t) - log ref(y_t)]" if settings.beta and not in_loss else ""
+    apart = "sum_t [log pi_old(y_t) - log ref(y_t)]"
+    beside = f" - {kl} (K_i - mean of the other K_j),  K_i = {apart}"
+    after = beside if settings.beta and settings.kl_in == "advantage" else ""
+    in_reward = f" - {kl} {apart}" if settings.beta and not after else ""
     lines = [
-        f"maximise  {AVERAGES[settings.reduction]} [ {gain}{in_loss} ]",
+        f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
         *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
-        f"A_i = {ADVANTAGES[settings.advantage]}",
+        f"A_i = {ADVANTAGES[settings.advantage]}{after}",
         f"R_i = score(y_i) - {settings.missing_end_penalty:g} [no end token]{in_reward}",
         f"{settings.prompts} prompts x {settings.responses} responses a batch, "
         f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",

@@ -41,6 +41,9 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
         except ValueError as error:
             kind = model.config.model_type
             raise ConfigError(f"{role}.lora_targets={targets} does not suit a {kind}: {error}") from error
+    for parameter in model.parameters():
+        if parameter.requires_grad:
+            parameter.data = parameter.data.float()  # small steps would be lost in half precision
     model.eval()  # type: ignore[no-untyped-call]
 
 

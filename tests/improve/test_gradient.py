@@ -57,9 +57,8 @@ def batch_of(policy: Table, count: int = 6) -> Batch[Rows]:
     mask = torch.arange(L) < lengths[:, None]
     rows = Rows(torch.randint(0, V, (count, L), generator=generator), mask)
     advantages = torch.randn(count, 1, generator=generator)
-    reference = torch.full((count, L), -math.log(V)) * mask
     logp = policy.log_prob(rows)[0].detach()
-    return Batch(rows, logp, advantages, returns=advantages + 0.5, reference=reference)
+    return Batch(rows, logp, advantages, returns=advantages + 0.5)
 
 
 def measure(
@@ -76,7 +75,7 @@ def measure(
 @pytest.mark.parametrize("reduction", ["token", "sequence", "constant"])
 @pytest.mark.parametrize("part", [1, 2, 100])
 def test_the_parts_of_a_minibatch_add_up_to_the_whole(reduction: Reduction, part: int) -> None:
-    objective = Objective(clip=0.2, value=0.5, entropy=0.1, beta=0.3, reduction=reduction)
+    objective = Objective(clip=0.2, value=0.5, entropy=0.1, reduction=reduction)
     whole, once = measure(objective)
     parts, in_parts = measure(objective, part)
     torch.testing.assert_close(parts, whole)
@@ -84,25 +83,19 @@ def test_the_parts_of_a_minibatch_add_up_to_the_whole(reduction: Reduction, part
 
 
 def test_a_step_is_the_gradient_of_the_objective_written_out() -> None:
-    found, metrics = measure(Objective(value=0.5, entropy=0.1, beta=0.3))
+    found, metrics = measure(Objective(value=0.5, entropy=0.1))
     policy = Table()
     batch = batch_of(policy)
     logp, entropy = policy.log_prob(batch.inputs)
     mask, steps = batch.inputs.mask, batch.inputs.mask.sum()
     assert batch.returns is not None
-    assert batch.reference is not None
-    apart = ((logp - batch.reference) * mask).detach()
-    to_go = torch.stack([apart[:, t:].sum(1) for t in range(L)], 1)  # a choice is charged for what comes after it too
     loss = (
         (-logp * batch.advantages * mask).sum()
-        + 0.3 * (logp * to_go * mask).sum()
         + 0.5 * ((policy.values(batch.inputs) - batch.returns) ** 2 / 2 * mask).sum()
         - 0.1 * (entropy * mask).sum()
     ) / steps
     torch.testing.assert_close(found, list(torch.autograd.grad(loss, policy.parameters())))
-    # The KL counts as its own number, not as its gradient's weights.
-    value = float(loss.detach()) + 0.3 * float((apart - logp.detach() * to_go).sum() / steps)
-    assert metrics["loss"] == pytest.approx(value)
+    assert metrics["loss"] == pytest.approx(float(loss.detach()))
     norm = torch.cat([g.flatten() for g in found]).norm()
     assert metrics["grad_norm"] == pytest.approx(float(norm))
 
@@ -134,15 +127,13 @@ def test_the_critic_can_learn_alone() -> None:
     assert set(metrics) == {"loss", "value_loss", "grad_norm"}
 
 
-def test_the_entropy_bonus_flattens_and_the_kl_pulls_to_the_reference() -> None:
-    policy = Table()
-    for objective in (Objective(entropy=1.0), Objective(beta=1.0)):
-        policy, start = Table(), Table()
-        batch = replace(batch_of(policy, 400), advantages=torch.zeros(400, 1))
-        update(policy, adam(policy.parameters(), 0.05), batch, [torch.arange(400)] * 60, objective)
-        flat = torch.full((L, V), -math.log(V))
-        after, before = (p.logits.detach().log_softmax(-1) for p in (policy, start))
-        assert (after - flat).abs().mean() < 0.7 * (before - flat).abs().mean()
+def test_the_entropy_bonus_flattens() -> None:
+    policy, start = Table(), Table()
+    batch = replace(batch_of(policy, 400), advantages=torch.zeros(400, 1))
+    update(policy, adam(policy.parameters(), 0.05), batch, [torch.arange(400)] * 60, Objective(entropy=1.0))
+    flat = torch.full((L, V), -math.log(V))
+    after, before = (p.logits.detach().log_softmax(-1) for p in (policy, start))
+    assert (after - flat).abs().mean() < 0.7 * (before - flat).abs().mean()
 
 
 def test_a_long_gradient_is_shortened() -> None:

@@ -62,7 +62,7 @@ VARIANTS: list[dict[str, object]] = [
         "clip": 0.2,
         "epochs": 2,
         "minibatches": 2,
-        "kl_in": "loss",
+        "kl_in": "advantage",
         "beta": 0.1,
     },
     {"advantage": "batch_mean", "reduction": "token", "temperature": 0.8, "kl_target": 3.0},
@@ -198,11 +198,11 @@ def test_the_reference_is_not_run_while_its_weight_is_zero(toy_reviews: Reviews)
         assert bool(runs) == (beta > 0)
 
 
-def test_a_kl_in_the_loss_leads_a_policy_back(toy_reviews: Reviews) -> None:
+def test_a_kl_off_the_advantage_leads_a_policy_back(toy_reviews: Reviews) -> None:
     """Where all responses are worth the same, nothing else moves it."""
     away = learner(toy_reviews, updates=6, beta=0.0, learning_rate=5e-3)
     away.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
-    back = learner(toy_reviews, updates=6, kl_in="loss", missing_end_penalty=0.0, learning_rate=2e-3)
+    back = learner(toy_reviews, updates=6, kl_in="advantage", missing_end_penalty=0.0, learning_rate=2e-3)
     back.load(away.state() | {"optimizer": back.state()["optimizer"], "beta": 1.0})
     equal = reward(constant=0.0)
     before = back.evaluate(equal, np.random.default_rng(0)).metrics["kl"]
@@ -352,9 +352,9 @@ def test_the_formula_says_what_the_settings_say() -> None:
     assert "mean of the prompt's other R_j" in plain
     assert "- 0.05 sum_t [log pi_old(y_t) - log ref(y_t)]" in plain
     other = TextLearnerSettings(
-        clip=0.2, epochs=2, kl_in="loss", beta=0.1, reduction="sequence", advantage="group_normalised"
+        clip=0.2, epochs=2, kl_in="advantage", beta=0.1, reduction="sequence", advantage="group_normalised"
     )
-    assert "min(r A_i, clip(r, 0.8, 1.2) A_i) - 0.1 KL[pi(y), ref(y)]" in other.formula()
+    assert "their std + 1e-4) - 0.1 (K_i - mean of the other K_j),  K_i = sum_t" in other.formula()
     assert "ref" not in text_formula(TextLearnerSettings(beta=0.0))
 
 
