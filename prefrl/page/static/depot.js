@@ -89,5 +89,7 @@ function written(transaction, act) {
     transaction.oncomplete = () => resolve();
     transaction.onabort = transaction.onerror = () => reject(transaction.error);
     act(transaction.objectStore(TABLE));
+    // At once: left to itself it waits for one more word from this page, which may be closed by then.
+    transaction.commit?.();
   });
 }
