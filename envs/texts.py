@@ -26,6 +26,7 @@ from prefrl.policies.cloning import make_tokenizer
 from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
 from prefrl.types import Floats, Response
 
+RESPONSE_TOKENS = 256
 ONLY_BYTES = 259
 """The 256 bytes, and the tokens for padding, begin and end."""
 
@@ -51,8 +52,9 @@ class TextsSettings(Settings):
     long_prompts: Long = "refuse"
     """What happens to prompts that leave no room for a response in the model's context: refuse them, cut them to their
     end, or skip them."""
-    response_tokens: int = Field(256, ge=2)
-    """The most tokens that a response may have, the end token included."""
+    response_tokens: int | None = Field(None, ge=2)
+    """The most tokens that a response may have, the end token included; by default 256, or half of the model's context
+    where that is less."""
     layers: int = Field(2, ge=1)
     """Of the small Llama."""
     width: int = Field(64, ge=8)
@@ -73,12 +75,14 @@ class TextsSettings(Settings):
     def build(self) -> Texts:
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
         model, tokenizer = _load(self.model, self.dtype) if self.model else _small(self)
-        opening = self._opening(model, tokenizer)
+        context = _context(model)
+        tokens = self.response_tokens or min(RESPONSE_TOKENS, (context or 2 * RESPONSE_TOKENS) // 2)
+        opening = self._opening(tokenizer, None if context is None else context - tokens)
         learning, left_out = _known(self.prompts, opening)
         kept, skipped = _known(self.evaluation_prompts, opening)
         own = set(kept) if kept else for_evaluation(list(learning))
         return Texts(
-            self.response_tokens,
+            tokens,
             tokenizer,
             model,
             _ends(model, tokenizer),
@@ -89,7 +93,7 @@ class TextsSettings(Settings):
             notes=(*left_out, *skipped),
         )
 
-    def _opening(self, model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> Opening:
+    def _opening(self, tokenizer: PreTrainedTokenizerBase, room: int | None) -> Opening:
         has = tokenizer.chat_template is not None
         chat = has if self.chat_template is None else self.chat_template
         if chat and not has:
@@ -100,12 +104,10 @@ class TextsSettings(Settings):
             )
         if chat:
             check_template(tokenizer)
-        known = getattr(model.config, "max_position_embeddings", None)  # some architectures have no bound
-        room = None if known is None else int(known) - self.response_tokens
         if room is not None and room < 1:
             raise ConfigError(
                 f"task.response_tokens={self.response_tokens} leaves no room for a prompt in the model's context of "
-                f"{known} tokens: set it lower"
+                f"{room + (self.response_tokens or 0)} tokens: set it lower"
             )
         return Opening(tokenizer, chat, self.system, room, self.long_prompts)
 
@@ -195,6 +197,12 @@ def _fits(prompt: Prompt, opening: Opening) -> bool:
     except ValueError as error:
         raise ValueError(f"{prompt.place}: {error}") from None
     return False
+
+
+def _context(model: PreTrainedModel) -> int | None:
+    """The most tokens that a model has positions for; some architectures have no bound."""
+    known = getattr(model.config, "max_position_embeddings", None)
+    return None if known is None else int(known)
 
 
 def _small(settings: TextsSettings) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:

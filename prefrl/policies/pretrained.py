@@ -36,6 +36,8 @@ def load_weights(
             model, info = auto.from_pretrained(
                 dtype=getattr(torch, dtype), use_safetensors=True, output_loading_info=True, **_where(name, download)
             )
+    except ImportError as error:
+        raise ConfigError(f"{name}: {first_line(error)}; for a .gguf file run: pip install 'prefrl[gguf]'") from error
     except (OSError, ValueError) as error:
         local = switch and not download
         hint = f"only local files are looked at unless {switch} is true" if local else first_line(error)
@@ -45,6 +47,10 @@ def load_weights(
     if missing := sorted(k for k in info["missing_keys"] if not (headless and "pooler" in k)):
         raise ConfigError(f"{name}: weights are missing, {missing[0]} for one: expected a complete checkpoint")
     found: PreTrainedModel = model
+    if Path(name).suffix == ".gguf":
+        # Its weights are whole numbers of floats by now, and can be trained and saved like any others.
+        model.hf_quantizer = None
+        del model.config.quantization_config
     return found
 
 
