@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,9 @@ from prefrl.envs.prompts import is_for_evaluation
 from prefrl.envs.reviews import reviews, source
 from prefrl.policies.cloning import CloningSettings
 from prefrl.types import Floats, Response
+
+SHIPPED = Path(__file__).parent / "starts" / "reviews"
+"""The starting policy of the default settings; `benchmarks/start_reviews.py` makes it."""
 
 
 class ReviewsSettings(Settings):
@@ -34,7 +38,7 @@ class ReviewsSettings(Settings):
 
     def build(self) -> Reviews:
         grammar = reviews()
-        return Reviews(self, grammar, *self.cloning.build(grammar.sample, source()))
+        return Reviews(self, grammar, *self.cloning.build(grammar.sample, source(), SHIPPED))
 
 
 class Reviews:

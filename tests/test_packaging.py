@@ -14,7 +14,7 @@ import pytest
 from prefrl.cli.schema import schema, text
 
 ROOT = Path(__file__).parent.parent
-SHIPPED = (".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed")
+SHIPPED = (".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed", ".safetensors")
 PAGES = "prefrl/page"
 
 
@@ -45,11 +45,7 @@ def test_a_wheel_holds_one_top_level_name_and_every_file_that_is_needed(wheel: P
         for p in (ROOT / folder).rglob("*.*")
     }
     here |= {p.relative_to(ROOT / "prefrl").as_posix() for p in (ROOT / "prefrl").rglob("*.*")}
-    wanted = {
-        f"prefrl/{name}"
-        for name in here
-        if name.endswith((".py", ".yaml", ".json", ".html", ".css", ".js", ".svg", ".typed"))
-    }
+    wanted = {f"prefrl/{name}" for name in here if name.endswith(SHIPPED)}
     assert {name for name in names if ".dist-info/" not in name} == wanted
     assert not [name for name in names if "test" in name]
 

@@ -5,6 +5,7 @@ What comes out is kept under a digest of everything that went in; a damaged copy
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import math
@@ -31,9 +32,12 @@ from prefrl.components import Settings
 from prefrl.policies.pretrained import load_weights, quiet
 from prefrl.seeding import draw_seed
 from prefrl.storage.files import DamagedError, verify, whole_folder
+from prefrl.types import Fields
 
 RECIPE = 1
 """Raise this when the same settings lead to another model: what older versions kept is then left alone."""
+RECIPE_FILE = "RECIPE.json"
+"""Of a shipped model: the digest of what it was made from."""
 PAD, BOS, EOS = "<pad>", "<bos>", "<eos>"
 IGNORED = -100
 Writer: TypeAlias = Callable[[np.random.Generator], tuple[str, str]]
@@ -69,11 +73,15 @@ class CloningSettings(Settings):
             raise ValueError(f"width must be a multiple of 2 x heads, got {self.width} and {self.heads}")
         return self
 
-    def build(self, write: Writer, source: str) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
-        """The model and its tokenizer: from the cache if they are there and whole, else cloned now.
+    def build(
+        self, write: Writer, source: str, shipped: Path | None = None
+    ) -> tuple[LlamaForCausalLM, PreTrainedTokenizerFast]:
+        """The model and its tokenizer: shipped, or from the cache if they are there and whole, else cloned now.
 
-        `source` tells one writer from another.
+        `source` tells one writer from another; `shipped` is a folder that `ship` wrote.
         """
+        if shipped is not None and json.loads((shipped / RECIPE_FILE).read_text()) == self.recipe(source):
+            return _load(shipped)
         folder = (self.cache or user_cache_path("prefrl") / "models") / self.digest(source)
         if not folder.exists():
             _make(self, write, folder)
@@ -85,12 +93,30 @@ class CloningSettings(Settings):
             _make(self, write, folder)
             return _load(folder)
 
+    def ship(self, write: Writer, source: str, folder: Path) -> None:
+        """Write the model in half precision, to be installed with the package: 2 MB, and the same on every machine."""
+        model, tokenizer = self.build(write, source)
+        with whole_folder(folder) as work, quiet():
+            half: Any = copy.deepcopy(model).to(torch.float16)  # type: ignore[arg-type]  # transformers wraps it
+            half.save_pretrained(work)
+            tokenizer.save_pretrained(work)
+            (work / RECIPE_FILE).write_text(json.dumps(self.recipe(source)))
+
+    def recipe(self, source: str) -> str:
+        """A digest of what is learned, and how: the settings and the writer's source."""
+        return _digest(self._lasting(), source, RECIPE)
+
     def digest(self, source: str) -> str:
         """Of the settings, the writer's source, and the versions that decide the weights."""
         versions = [RECIPE, torch.__version__, transformers.__version__, tokenizers.__version__]
-        # Where a model is kept does not change it.
-        everything = [self.model_dump(mode="json", exclude={"cache"}), source, versions]
-        return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:24]
+        return _digest(self._lasting(), source, versions)
+
+    def _lasting(self) -> Fields:
+        return self.model_dump(mode="json", exclude={"cache"})  # where a model is kept does not change it
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def _make(settings: CloningSettings, write: Writer, folder: Path) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import re
 from pathlib import Path
 from typing import cast
 
 import pytest
+import torch
 from pydantic import ValidationError
 from rich.console import Console
 
 from prefrl.envs.reviews import reviews, source
-from prefrl.envs.text import ReviewsSettings
+from prefrl.envs.text import SHIPPED, ReviewsSettings
 from prefrl.policies.cloning import CloningSettings, progress
+from prefrl.storage.files import verify
 
 REVIEWS = reviews()
 TINY = {"layers": 1, "width": 16, "heads": 2, "vocabulary": 400, "reviews": 128, "batch_size": 32}
@@ -84,3 +87,33 @@ def test_another_size_seed_or_grammar_is_another_model_and_the_folder_is_not_par
 def test_a_width_that_cannot_be_split_into_heads_is_an_error() -> None:
     with pytest.raises(ValidationError, match="multiple of 2 x heads"):
         CloningSettings(width=100, heads=8)
+
+
+def test_what_is_shipped_was_made_by_todays_recipe_and_is_whole() -> None:
+    """Else `python benchmarks/start_reviews.py` has not been run since."""
+    recipe = json.loads((SHIPPED / "RECIPE.json").read_text())
+    assert recipe == CloningSettings().recipe(source())
+    verify(SHIPPED)
+    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 2.1e6
+
+
+def test_default_settings_need_no_cloning_and_others_do(tmp_path: Path) -> None:
+    task = ReviewsSettings(cloning=CloningSettings(cache=tmp_path)).build()
+    assert not list(tmp_path.iterdir())
+    assert task.model().dtype == torch.float32
+    said = "".join(str(task.tokenizer.decode(list(task.encode("I read this book.")))).split())
+    assert said.endswith("Ireadthisbook.")
+    small = tiny(tmp_path, reviews=64).build(reviews().sample, source(), SHIPPED)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert small[0].config.hidden_size != task.model().config.hidden_size
+
+
+def test_shipping_writes_the_same_model_in_half_precision(tmp_path: Path) -> None:
+    settings = tiny(tmp_path / "cache")
+    settings.ship(reviews().sample, source(), tmp_path / "shipped")
+    made, _ = settings.build(reviews().sample, source())
+    loaded, tokenizer = settings.build(reviews().sample, source(), tmp_path / "shipped")
+    assert loaded.dtype == torch.float32
+    for one, other in zip(loaded.parameters(), made.parameters(), strict=True):
+        assert torch.equal(one, other.half().float())
+    assert tokenizer.encode("A film.") == settings.build(reviews().sample, source())[1].encode("A film.")
