@@ -86,9 +86,9 @@ REFUSED: dict[str, dict[str, Any]] = {
 """Their state is no cache of keys and values that can be repeated, cut and put after left padding."""
 
 
-def tiny(name: str) -> PreTrainedModel:
+def tiny(name: str, **changes: Any) -> PreTrainedModel:
     """Random weights, three times as large as they start, so that what is wrong shows."""
-    config = CONFIG_MAPPING[name](**SIZE | MORE.get(name, REFUSED.get(name, {})))
+    config = CONFIG_MAPPING[name](**SIZE | MORE.get(name, REFUSED.get(name, {})) | changes)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model: Any = AutoModelForCausalLM.from_config(config)  # type: ignore[no-untyped-call]

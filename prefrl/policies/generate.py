@@ -1,4 +1,4 @@
-"""Sampling from a causal language model: our own decode loop, for any model of transformers and fast for Llamas.
+"""Sampling from a causal language model: our own decode loop, for any of transformers', and fast for the usual ones.
 
 Prompts are padded on the left and run once for each group of samples; tokens are drawn by inverting the CDF; rows that
 have ended leave the batch. What comes back was drawn from the raw policy: no generation config has a say.
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from transformers import DynamicCache, PreTrainedModel
 
-from prefrl.policies.llama import LlamaDecoder
+from prefrl.policies.decoder import FastDecoder, plan
 
 KEEP_SHARE = 0.75
 """Ended rows are dropped once this share or less of the rows goes on: moving the cache costs more than a few rows."""
@@ -100,7 +100,7 @@ def generate(
 ) -> Generation:
     """Draw K responses to each of P prompts (token ids). Raises `ValueError` while the model is in training mode.
 
-    `fast` allows the decoder made for Llamas, which agrees with the general one to rounding.
+    `fast` allows the decoder that is written out, which agrees with the general one to rounding.
     """
     if model.training:
         raise ValueError("generation wants the model in eval mode: dropout would falsify its log-probabilities")
@@ -137,8 +137,9 @@ def _prefill(
         logits_to_keep=1,
     )
     logits = out.logits[:, -1].repeat_interleave(sampling.samples, 0)  # (P, V) -> (B, V)
-    if fast and LlamaDecoder.fits(model):
-        return LlamaDecoder(model, cache, mask, sampling.samples, sampling.max_tokens), logits
+    planned = plan(model, mask.shape[1] + sampling.max_tokens) if fast else None
+    if planned is not None:
+        return FastDecoder(planned, cache, mask, sampling.samples, sampling.max_tokens), logits
     return CacheDecoder(model, cache, mask, sampling.samples), logits
 
 

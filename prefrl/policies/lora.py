@@ -18,6 +18,7 @@ from peft import LoraConfig, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
 from safetensors.numpy import save_file
 from transformers import PreTrainedModel
+from transformers.pytorch_utils import Conv1D
 
 from prefrl.components import ConfigError
 from prefrl.seeding import draw_seed, to_numpy
@@ -31,7 +32,9 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
     """
     chosen = "all-linear" if targets == "all-linear" else None
     # No dropout: what a network says of one response must not differ between passes.
-    config = LoraConfig(r=rank, lora_alpha=2 * rank, lora_dropout=0.0, target_modules=chosen)
+    config = LoraConfig(
+        r=rank, lora_alpha=2 * rank, lora_dropout=0.0, target_modules=chosen, fan_in_fan_out=_turned_round(model)
+    )
     model.requires_grad_(False)
     # peft draws from torch's global generator.
     with torch.random.fork_rng(devices=[]):
@@ -45,6 +48,11 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
         if parameter.requires_grad:
             parameter.data = parameter.data.float()  # small steps would be lost in half precision
     model.eval()  # type: ignore[no-untyped-call]
+
+
+def _turned_round(model: PreTrainedModel) -> bool:
+    """Whether a model keeps its matrices as (in, out), as GPT-2 does."""
+    return any(isinstance(module, Conv1D) for module in model.modules())
 
 
 @contextmanager
@@ -76,6 +84,7 @@ def save_adapters(model: PreTrainedModel, folder: Path) -> None:
         lora_alpha=2 * rank,
         lora_dropout=0.0,
         target_modules=sorted(layers),
+        fan_in_fan_out=_turned_round(model),
         task_type="CAUSAL_LM",
         base_model_name_or_path=base,
     )

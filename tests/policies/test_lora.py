@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from families import tiny
 from peft import PeftModel
 from transformers import AutoModelForCausalLM, AutoTokenizer
 
@@ -17,6 +18,7 @@ from prefrl.envs.text import Reviews
 from prefrl.improve.text import TextLearner, TextLearnerSettings
 from prefrl.policies.generate import Sampling, generate
 from prefrl.policies.language import LanguagePolicy, Lora, Responses
+from prefrl.policies.lora import add_adapters, without_adapters
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response
 
@@ -62,6 +64,25 @@ def test_adapters_change_nothing_at_first_and_only_they_are_kept(toy_reviews: Re
     assert all("lora_" in name for name in state["model"])
     fresh.load(state)
     assert torch.equal(fresh.policy.log_prob(drawn)[0], one.policy.log_prob(drawn)[0])
+
+
+@pytest.mark.parametrize("name", ["gpt2", "gpt_neox", "phi", "qwen2"])
+def test_every_shape_that_is_written_out_knows_adapters(name: str, rng: np.random.Generator) -> None:
+    model = tiny(name)
+    add_adapters(model, 4, "all-linear", rng, "learner")
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.requires_grad:
+                parameter.add_(torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)), alpha=0.3)
+    found = [
+        generate(model, [[3, 4, 5], [6]], Sampling(2, 12, ()), torch.Generator().manual_seed(0), fast=fast)
+        for fast in (True, False)
+    ]
+    assert torch.equal(found[0].tokens, found[1].tokens)
+    torch.testing.assert_close(found[0].logp, found[1].logp, atol=1e-4, rtol=0)
+    with without_adapters(model):
+        bare = generate(model, [[3, 4, 5], [6]], Sampling(2, 12, ()), torch.Generator().manual_seed(0))
+    assert not torch.equal(bare.logp, found[0].logp)
 
 
 def test_sampling_with_adapters_is_fast_and_exact(toy_reviews: Reviews) -> None:
