@@ -149,11 +149,12 @@ def ours(folder: Path) -> None:
 
     torch.set_num_threads(1)
     words = PreTrainedTokenizerFast(tokenizer_file=str(folder / "words.json"))
-    tokenizer = SimpleNamespace(encode=words.encode, decode=words.decode, eos_token_id=-1)  # no end: a fixed length
     rounds = iter(range(10**6))
     task: Any = SimpleNamespace(
         kind="text",
-        tokenizer=tokenizer,
+        tokenizer=words,
+        encode=lambda prompt: tuple(words.encode(prompt)),
+        ends=(),  # a fixed length
         response_tokens=NEW_TOKENS,
         model=lambda: LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32).eval(),
         prompts=lambda count, rng: prompts(next(rounds)),

@@ -166,7 +166,8 @@ def round_line(round: Round) -> Text:
         ("steps/learn", "steps", ",.0f"),
     ):
         if not math.isnan(m.get(key, math.nan)):
-            parts.append(Text(f"{label} {m[key]:z{form}}"))
+            count = f" of {m['fit/held_out']:.0f}" if label == "accuracy" and "fit/held_out" in m else ""
+            parts.append(Text(f"{label} {m[key]:z{form}}{count}"))
     seconds = sum(v for k, v in m.items() if k.startswith("seconds/"))
     return Text("  ").join([*parts, Text(duration(seconds), style="dim")])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ def responses(
     """One response at temperature 1 to each of so many evaluation prompts, and how many tokens that took.
 
     Metrics: gold, gold_std, learned, kl (nats per response: the mean log-ratio to the starting policy), length
-    (tokens), ended (share), and fluency where the task can tell.
+    (tokens), ended (share), distinct_1 and distinct_2 (shares), and fluency where the task can tell.
     """
     task = policy.task
     drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, policy.sampling(1, temperature=1.0))
@@ -58,6 +59,17 @@ def responses(
         "length": float(drawn.mask.sum(1).float().mean()),
         "ended": float(drawn.ended.float().mean()),
     }
+    words = [one.text.split() for one in found]
+    metrics |= {f"distinct_{n}": distinct(words, n) for n in (1, 2)}
     fluent = task.fluency(found)
     metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
     return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count
+
+
+def distinct(texts: Sequence[Sequence[str]], n: int) -> float:
+    """The share of all runs of n words that are different ones (Li et al. 2016, section 5.3); 0 where there are none.
+
+    It falls when a policy says one thing over and over. It depends on how many texts there are.
+    """
+    runs = [tuple(words[i : i + n]) for words in texts for i in range(len(words) - n + 1)]
+    return len(set(runs)) / max(len(runs), 1)

@@ -26,6 +26,7 @@ from prefrl.improve.objectives import (
     batch_centred,
     group_normalised,
     kl_k1,
+    kl_k3,
     leave_one_out,
     masked_mean,
     step_rewards,
@@ -74,6 +75,8 @@ class TextLearnerSettings(Settings):
     """Where the KL is taken off: the reward, before the baseline, or the advantage, after it was normalised."""
     kl_target: float | None = Field(None, gt=0)
     """Steer beta to this KL in nats per response (Ziegler et al. 2019); null leaves it alone."""
+    kl_stop: float | None = Field(None, gt=0)
+    """End a round's updates once a batch is farther than this from the starting policy, in nats per response."""
     kl_horizon: float = Field(10_000.0, gt=0)
     """Responses over which beta is steered."""
     reduction: Reduction = "constant"
@@ -166,7 +169,7 @@ class TextLearner:
         return self._writer.ask(count, self._settings.asked_responses, rng)
 
     def improve(self, reward: RewardModel[Response], store: Store[Response], rng: np.random.Generator) -> Metrics:
-        """`updates` batches of fresh responses; the metrics are means over them.
+        """`updates` batches of fresh responses, or fewer where they end at `kl_stop`; the metrics are means over them.
 
         reward and reward_std (learned scores before penalties), kl (k1, nats per response), surprise (nats per token:
         minus the mean log-probability of what was sampled), length (tokens), ended (share), beta, and those of the last
@@ -175,11 +178,14 @@ class TextLearner:
         seen: dict[str, list[float]] = defaultdict(list)
         for _ in range(self._settings.updates):
             drawn = self._writer.write(self._settings.prompts, self._settings.responses, rng)
-            for name, value in self._update(drawn, reward, rng).items():
+            measured = self._update(drawn, reward, rng)
+            for name, value in measured.items():
                 seen[name].append(value)
             self._updates += 1
+            if self._settings.kl_stop is not None and measured["kl"] > self._settings.kl_stop:
+                break
         means = {name: float(np.mean(values)) for name, values in seen.items()}
-        return means | {"ratio_error": max(seen["ratio_error"])}
+        return means | {"ratio_error": max(seen["ratio_error"]), "updates": float(len(seen["ratio_error"]))}
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
         return self._writer.evaluate(self._settings.evaluation_prompts, reward, rng)
@@ -219,7 +225,7 @@ class TextLearner:
             "reward": float(raw.nanmean()),
             "reward_std": float(raw[scored].std(correction=0)) if scored.any() else math.nan,
             "unscored": 1.0 - float(scored.float().mean()),
-            **({"kl": sequence_kl} if settings.beta else {}),  # what was not measured is absent, not 0
+            **(self._distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
             "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
             "length": float(drawn.mask.sum(1).float().mean()),
             "ended": float(drawn.ended.float().mean()),
@@ -253,7 +259,17 @@ class TextLearner:
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
         """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
-        return drawn.logp if self._settings.beta == 0 else self.policy.start_logp(drawn)
+        return self.policy.start_logp(drawn) if self._measures else drawn.logp
+
+    @property
+    def _measures(self) -> bool:
+        """Whether anything wants to know how far the policy is from where it started."""
+        return self._settings.beta > 0 or self._settings.kl_stop is not None
+
+    def _distances(self, kl: Tensor, mask: Tensor) -> Metrics:
+        """Two estimates of the KL per response: k1, and k3, which is never negative."""
+        k3 = kl_k3(kl, torch.zeros_like(kl))
+        return {"kl": float(kl.sum(1).mean()), "kl_k3": float(torch.where(mask, k3, 0.0).sum(1).mean())}
 
     def _minibatches(self, size: int, rng: np.random.Generator) -> list[Tensor]:
         order = generator(rng)

@@ -105,6 +105,19 @@ def test_a_kl_that_was_not_measured_is_absent(toy_reviews: Reviews, beta: float)
     assert metrics.get("kl") != 0.0
 
 
+def test_a_round_ends_where_the_policy_has_gone_too_far(toy_reviews: Reviews) -> None:
+    likes = reward(word(toy_reviews))
+    free = learner(toy_reviews, updates=12, prompts=8, learning_rate=5e-3, beta=0.0)
+    held = learner(toy_reviews, updates=12, prompts=8, learning_rate=5e-3, beta=0.0, kl_stop=0.5)
+    far, near = (one.improve(likes, NO_STORE, np.random.default_rng(1)) for one in (free, held))
+    assert far["updates"] == 12
+    assert 2 <= near["updates"] < 12
+    assert "kl" not in far
+    assert near["kl_k3"] > 0
+    kl = [one.evaluate(likes, np.random.default_rng(0)).metrics["kl"] for one in (free, held)]
+    assert kl[1] < 0.7 * kl[0]
+
+
 def test_gold_is_neither_read_nor_attached_while_learning(toy_reviews: Reviews) -> None:
     blind = _WithoutGold(toy_reviews)
     seeing, unseeing = learner(toy_reviews), TextLearnerSettings(**SMALL).build(blind, np.random.default_rng(0))
@@ -165,7 +178,17 @@ def test_an_evaluation_repeats_itself_and_starts_without_kl(toy_reviews: Reviews
     first, second = (one.evaluate(likes, np.random.default_rng(3)) for _ in range(2))
     assert first.metrics == second.metrics
     assert abs(first.metrics["kl"]) < 1e-3
-    assert set(first.metrics) == {"gold", "gold_std", "learned", "kl", "length", "ended", "fluency"}
+    assert set(first.metrics) == {
+        "gold",
+        "gold_std",
+        "learned",
+        "kl",
+        "length",
+        "ended",
+        "fluency",
+        "distinct_1",
+        "distinct_2",
+    }
     assert len(first.examples) == 4
     assert all(r.gold is not None for r in first.examples)
 
