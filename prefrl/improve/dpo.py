@@ -18,8 +18,8 @@ from prefrl.components import Settings
 from prefrl.fit.pairs import Batch, batch
 from prefrl.improve.gradient import Parts, descend
 from prefrl.improve.objectives import dpo_loss
-from prefrl.improve.writer import Targets, Writer
-from prefrl.policies.language import LanguagePolicy, Responses
+from prefrl.improve.writer import Writer
+from prefrl.policies.language import LanguageSettings, Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device
 from prefrl.types import Evaluation, Integers, Metrics, Response, State, Steps
@@ -45,18 +45,11 @@ class DPOSettings(Settings):
     """Responses to each prompt that is sampled for being asked about."""
     evaluation_prompts: int = Field(128, ge=1)
     """Each gets one response at temperature 1."""
-    chunk: int = Field(64, ge=2)
-    """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
-    train: Literal["full", "lora"] = "full"
-    """What learning changes: everything, or low-rank adapters alone (LoRA), which take far less memory."""
-    lora_rank: int = Field(16, ge=1)
-    """The rank of the adapters."""
-    lora_targets: Targets = "all-linear"
-    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
+    policy: LanguageSettings = LanguageSettings()
+    """What of the model is trained, and how much of it at once."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     discount: ClassVar[float] = 1.0  # a response is judged as a whole
-    temperature: ClassVar[float] = 1.0
 
     def shrunk(self) -> DPOSettings:
         return self.model_copy(update={"epochs": 1, "evaluation_prompts": 8})
@@ -79,12 +72,8 @@ class DPO:
     """A `prefrl.protocols.Learner` of responses that reads the judgements in the store, and not the reward."""
 
     def __init__(self, settings: DPOSettings, task: TextTask, rng: np.random.Generator) -> None:
-        self._settings = settings
-        self._writer = Writer(task, settings, rng)
-
-    @property
-    def policy(self) -> LanguagePolicy:
-        return self._writer.policy
+        self._settings, self._writer = settings, Writer(task, settings, rng)
+        self.policy = self._writer.policy
 
     @property
     def steps(self) -> Steps:
@@ -97,7 +86,7 @@ class DPO:
         """Passes over all judged pairs. Metrics, means over steps: loss, grad_norm, pairs, accuracy (share whose better
         one gained more on the reference; a tie is half), margin (beta x nats). Raises ValueError without a judged pair.
         """
-        data, policy = batch(store.judged()), self._writer.policy
+        data, policy = batch(store.judged()), self.policy
         if not len(data):
             raise ValueError("dpo learns from judged pairs; the store holds none: raise loop.labels, or import some")
         rows = Responses.of(data.candidates, policy.task, policy.device)
@@ -111,11 +100,11 @@ class DPO:
 
     def _parts(self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers) -> Parts:
         """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
-        for some in np.array_split(at, -(-2 * len(at) // self._settings.chunk)):
+        for some in np.array_split(at, -(-2 * len(at) // self._settings.policy.chunk)):
             # Shares of the whole minibatch: the parts add up to its mean. The two of a pair stand side by side: (2 m,).
             arrays = (data.weight[some] / data.weight[at].sum(), data.edges[some].flatten(), data.preference[some])
             share, pairs, preference = (torch.from_numpy(x).to(reference.device) for x in arrays)
-            gains = (self._writer.policy.log_prob(rows.rows(pairs))[0].sum(1) - reference[pairs]).view(-1, 2)
+            gains = (self.policy.log_prob(rows.rows(pairs))[0].sum(1) - reference[pairs]).view(-1, 2)
             margin = self._settings.beta * (gains[:, 0] - gains[:, 1])
             loss = (dpo_loss(margin, preference, self._settings.label_smoothing) * share).sum()
             signed = (margin * (2 * preference - 1).sign()).detach()  # 0 for a tie, which makes it half right below

@@ -31,8 +31,8 @@ from prefrl.improve.objectives import (
     masked_mean,
     step_rewards,
 )
-from prefrl.improve.writer import Targets, Writer
-from prefrl.policies.language import Responses
+from prefrl.improve.writer import Writer
+from prefrl.policies.language import LanguageSettings, Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device, generator
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
@@ -97,14 +97,8 @@ class TextLearnerSettings(Settings):
     """Responses to each prompt that is sampled for being asked about."""
     evaluation_prompts: int = Field(128, ge=1)
     """Each gets one response at temperature 1."""
-    chunk: int = Field(64, ge=1)
-    """Rows in one pass of a network: changes memory and speed, and nothing else but rounding."""
-    train: Literal["full", "lora"] = "full"
-    """What learning changes: everything, or low-rank adapters alone (LoRA), which take far less memory."""
-    lora_rank: int = Field(16, ge=1)
-    """The rank of the adapters."""
-    lora_targets: Targets = "all-linear"
-    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
+    policy: LanguageSettings = LanguageSettings()
+    """What of the model is trained, and how much of it at once."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
@@ -155,7 +149,7 @@ class TextLearner:
 
     def __init__(self, settings: TextLearnerSettings, task: TextTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
-        self._writer = Writer(task, settings, rng)
+        self._writer = Writer(task, settings, rng, settings.temperature)
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0
@@ -214,7 +208,7 @@ class TextLearner:
         advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kl)
         batch = Batch(drawn, drawn.logp, advantages.view(-1, 1))  # (B, 1): the same for all tokens
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
-        steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.chunk)
+        steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
         self._check_ratio(steps[0]["ratio_error"])
         # Per response, as the target is: a mean per token would be smaller by the length.
         sequence_kl = float(kl.sum(1).mean())

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import copy
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from prefrl.evaluate.policies import responses
 from prefrl.improve.gradient import adam
-from prefrl.policies.language import LanguagePolicy, Lora, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
 from prefrl.protocols import RewardModel, TextTask
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Response, State, Steps
-
-Targets: TypeAlias = Literal["all-linear", "default"]
 
 
 class WriterSettings(Protocol):
@@ -24,25 +22,10 @@ class WriterSettings(Protocol):
     def learning_rate(self) -> float: ...
 
     @property
-    def temperature(self) -> float:
-        """Of sampling, and of every log-probability in the objective."""
-
-    @property
-    def chunk(self) -> int:
-        """Rows in one pass of a network."""
-
-    @property
     def device(self) -> Device: ...
 
     @property
-    def train(self) -> Literal["full", "lora"]:
-        """What learning changes: everything, or adapters alone."""
-
-    @property
-    def lora_rank(self) -> int: ...
-
-    @property
-    def lora_targets(self) -> Targets: ...
+    def policy(self) -> LanguageSettings: ...
 
 
 @runtime_checkable
@@ -56,9 +39,11 @@ class WritesText(Protocol):
 class Writer:
     """A policy with its optimiser, and how many tokens it wrote for what."""
 
-    def __init__(self, task: TextTask, settings: WriterSettings, rng: np.random.Generator) -> None:
-        lora = Lora(settings.lora_rank, settings.lora_targets) if settings.train == "lora" else None
-        self.policy = LanguagePolicy(task, settings.temperature, settings.chunk, lora, rng)
+    def __init__(
+        self, task: TextTask, settings: WriterSettings, rng: np.random.Generator, temperature: float = 1.0
+    ) -> None:
+        """`temperature`: of sampling, and of every log-probability in the objective."""
+        self.policy = LanguagePolicy(task, temperature, settings.policy, rng)
         self.policy.to(device_of(settings.device))
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self.steps = Steps()

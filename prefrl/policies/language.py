@@ -7,13 +7,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
+from prefrl.components import Settings
 from prefrl.policies.exact import check_exact, rows_of_embedding
 from prefrl.policies.generate import Sampling, generate
 from prefrl.policies.pretrained import quiet
@@ -90,41 +92,46 @@ class Responses:
         return found
 
 
-class Lora(NamedTuple):
-    """What is trained in place of a model's own weights."""
+class LanguageSettings(Settings):
+    """What of a language model is trained, and how much of it at once."""
 
-    rank: int
-    targets: str
+    train: Literal["full", "lora"] = "full"
+    """What learning changes: everything, or low-rank adapters alone (LoRA), which take far less memory."""
+    lora_rank: int = Field(16, ge=1)
+    """The rank of the adapters."""
+    lora_targets: Literal["all-linear", "default"] = "all-linear"
+    """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
+    chunk: int = Field(64, ge=2)
+    """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
 
 
 class LanguagePolicy:
     """A `prefrl.protocols.Policy` of `Responses`: a causal language model beside the one that it started from.
 
     Both stay in evaluation mode throughout, so the probability ratio is 1 (to rounding) before a batch's first step.
-    `temperature` is that of sampling and of every log-probability, unless another is asked for; at most `part` rows go
-    through a network at once. With `lora` its adapters alone are trained (their start is drawn from `rng`), and the
-    model without them is the one that it started from. Raises `ConfigError` for models that are not what is computed
-    here, see `exact`.
+    `temperature` is that of sampling and of every log-probability, unless another is asked for. With LoRA the adapters
+    alone are trained (their start is drawn from `rng`), and the model without them is the one that it started from.
+    Raises `ConfigError` for models that are not what is computed here, see `exact`.
     """
 
     def __init__(
         self,
         task: TextTask,
         temperature: float,
-        part: int,
-        lora: Lora | None = None,
+        settings: LanguageSettings = LanguageSettings(),  # noqa: B008  # frozen
         rng: np.random.Generator | None = None,
     ) -> None:
-        self.task, self.temperature, self.part = task, temperature, part
+        self.task, self.temperature, self.part = task, temperature, settings.chunk
         self.model = task.model()
         self._head_alone = head_alone(self.model)
         check_exact(self.model, self._probe)
-        if lora is None:
+        if settings.train == "full":
             self.start = task.model().requires_grad_(False)  # a second copy of the weights
             return
         from prefrl.policies.lora import add_adapters  # peft takes seconds to load
 
-        add_adapters(self.model, lora.rank, lora.targets, rng or np.random.default_rng(0), "learner")
+        rng = rng or np.random.default_rng(0)
+        add_adapters(self.model, settings.lora_rank, settings.lora_targets, rng, "learner.policy")
         self.start = self.model
 
     @property

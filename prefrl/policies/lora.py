@@ -28,7 +28,7 @@ def add_adapters(model: PreTrainedModel, rank: int, targets: str, rng: np.random
     """Give a model's matrices adapters, scaled by 2; they change nothing at first.
 
     `targets`: "all-linear", or "default" for those that peft takes for this architecture; `role`: whose setting it is,
-    "reward" or "learner". Everything else is frozen; adapters are float32, whatever the model is.
+    "reward" or "learner.policy". Everything else is frozen; adapters are float32, whatever the model is.
     """
     chosen = "all-linear" if targets == "all-linear" else None
     # No dropout: what a network says of one response must not differ between passes.
@@ -75,7 +75,7 @@ def save_adapters(model: PreTrainedModel, folder: Path) -> None:
     """Write the adapters alone, as peft's `PeftModel.from_pretrained` reads them. Raises `ConfigError` without any."""
     found = {name: to_numpy(p) for name, p in model.named_parameters() if "lora_" in name}
     if not found:
-        raise ConfigError("the policy has no adapters to export: it was trained whole (learner.train=full)")
+        raise ConfigError("the policy has no adapters to export: it was trained whole (learner.policy.train=full)")
     layers = {n: m for n, m in model.named_modules() if isinstance(m, BaseTunerLayer)}
     rank = next(len(p) for name, p in found.items() if "lora_A" in name)
     base = model.config._name_or_path or None

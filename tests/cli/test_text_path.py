@@ -54,7 +54,7 @@ def test_prompts_a_model_and_a_function_give_a_tuned_model_in_two_commands(
 ) -> None:
     write("prompts.jsonl", *({"prompt": f"What is {i} + 1?", "answer": str(i + 1)} for i in range(12)))
     settings = f"task.kind=texts task.model={own_model} task.prompts=prompts.jsonl reward.functions=[answer]"
-    assert prefrl(f"run text/sentiment {settings} learner.train={train} {SMALL} --out run") == 0
+    assert prefrl(f"run text/sentiment {settings} learner.policy.train={train} {SMALL} --out run") == 0
     assert "gold" not in prefrl.out.partition("texts (text)")[0]
     assert prefrl("export run --form policy --to tuned") == 0
     assert "AutoModelForCausalLM.from_pretrained reads it" in prefrl.out

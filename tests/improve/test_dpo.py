@@ -69,7 +69,13 @@ class Likes:
 
 
 LIKES = cast("RewardModel[Response]", Likes())
-SMALL: dict[str, Any] = {"evaluation_prompts": 64, "learning_rate": 5e-3, "minibatch": 8, "epochs": 3, "chunk": 6}
+SMALL: dict[str, Any] = {
+    "evaluation_prompts": 64,
+    "learning_rate": 5e-3,
+    "minibatch": 8,
+    "epochs": 3,
+    "policy": {"chunk": 6},
+}
 
 
 def learner(task: Reviews, **changes: object) -> DPO:
@@ -125,7 +131,7 @@ def test_the_same_seed_gives_the_same_bytes_and_a_resumed_learner_goes_on_alike(
 def test_the_size_of_a_chunk_changes_a_step_by_rounding_only(toy_reviews: Reviews, judged: Store[Response]) -> None:
     found = []
     for chunk in (2, 1000):
-        one = learner(toy_reviews, chunk=chunk, minibatch=1000, epochs=1)
+        one = learner(toy_reviews, policy={"chunk": chunk}, minibatch=1000, epochs=1)
         found.append(one.improve(LIKES, judged, np.random.default_rng(1)))
     for name in ("loss", "grad_norm", "margin"):
         assert found[0][name] == pytest.approx(found[1][name], rel=1e-3, abs=1e-4)

@@ -139,7 +139,13 @@ def solved() -> tuple[TextTask, LlamaForCausalLM]:
 
 
 def improved(task: TextTask, at: Mapping[str, Tensor] | None, updates: int, rate: float, changes: Any) -> TextLearner:
-    settings: dict[str, Any] = {"updates": updates, "prompts": 16, "responses": 16, "beta": BETA, "chunk": 1000}
+    settings: dict[str, Any] = {
+        "updates": updates,
+        "prompts": 16,
+        "responses": 16,
+        "beta": BETA,
+        "policy": {"chunk": 1000},
+    }
     settings |= {"missing_end_penalty": 0.0, "learning_rate": rate} | changes
     one = TextLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
     if at is not None:

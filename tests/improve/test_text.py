@@ -17,7 +17,7 @@ from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
 
 NO_STORE = cast("Store[Response]", None)
-SMALL: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "evaluation_prompts": 16, "chunk": 7}
+SMALL: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "evaluation_prompts": 16, "policy": {"chunk": 7}}
 
 
 @dataclass
@@ -257,7 +257,7 @@ def test_equal_rewards_teach_nothing(toy_reviews: Reviews) -> None:
 def test_the_size_of_a_chunk_changes_the_gradient_by_rounding_only(toy_reviews: Reviews) -> None:
     results = []
     for chunk in (3, 1000):
-        one = learner(toy_reviews, updates=1, chunk=chunk, reduction="token", learning_rate=1e-9)
+        one = learner(toy_reviews, updates=1, policy={"chunk": chunk}, reduction="token", learning_rate=1e-9)
         metrics = one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
         results.append((metrics["loss"], metrics["grad_norm"]))
     np.testing.assert_allclose(results[0], results[1], rtol=1e-3, atol=1e-5)

@@ -17,7 +17,7 @@ from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
 from prefrl.improve.text import TextLearner, TextLearnerSettings
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.language import LanguagePolicy, Lora, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
 from prefrl.policies.lora import add_adapters, without_adapters
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response
@@ -31,7 +31,7 @@ class Long:
 
 
 def learner(task: Reviews, **changes: Any) -> TextLearner:
-    given: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "train": "lora", "lora_rank": 4}
+    given: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "policy": {"train": "lora", "lora_rank": 4}}
     settings = TextLearnerSettings.model_validate(given | {"learning_rate": 1e-2} | changes)
     return settings.build(task, np.random.default_rng(0))
 
@@ -47,7 +47,7 @@ def some(policy: LanguagePolicy, rng: np.random.Generator) -> Responses:
 
 
 def test_the_start_is_the_model_without_its_adapters(toy_reviews: Reviews, rng: np.random.Generator) -> None:
-    whole, one = LanguagePolicy(toy_reviews, 1.0, 5), improved(toy_reviews).policy
+    whole, one = LanguagePolicy(toy_reviews, 1.0), improved(toy_reviews).policy
     drawn = some(whole, rng)
     torch.testing.assert_close(one.start_logp(drawn), whole.start_logp(drawn))
     assert (one.log_prob(drawn)[0] - one.start_logp(drawn)).abs().max() > 0.01
@@ -69,7 +69,7 @@ def test_adapters_change_nothing_at_first_and_only_they_are_kept(toy_reviews: Re
 @pytest.mark.parametrize("name", ["gpt2", "gpt_neox", "phi", "qwen2"])
 def test_every_shape_that_is_written_out_knows_adapters(name: str, rng: np.random.Generator) -> None:
     model = tiny(name)
-    add_adapters(model, 4, "all-linear", rng, "learner")
+    add_adapters(model, 4, "all-linear", rng, "learner.policy")
     with torch.no_grad():
         for parameter in model.parameters():
             if parameter.requires_grad:
@@ -101,7 +101,7 @@ def test_sampling_with_adapters_is_fast_and_exact(toy_reviews: Reviews) -> None:
 def test_an_exported_policy_is_what_transformers_loads(
     toy_reviews: Reviews, tmp_path: Path, train: str, rng: np.random.Generator
 ) -> None:
-    policy = improved(toy_reviews, train=train).policy
+    policy = improved(toy_reviews, policy={"train": train}).policy
     drawn = some(policy, rng)
     policy.save(tmp_path / "policy")
     loaded: Any = AutoModelForCausalLM.from_pretrained(tmp_path / "policy")
@@ -119,8 +119,8 @@ def test_exported_adapters_are_what_peft_loads(toy_reviews: Reviews, tmp_path: P
     policy.save(tmp_path / "adapter", adapter=True)
     loaded: Any = PeftModel.from_pretrained(toy_reviews.model(), tmp_path / "adapter").eval()
     torch.testing.assert_close(_plain(loaded, drawn), policy.log_prob(drawn)[0].detach(), atol=1e-5, rtol=0)
-    with pytest.raises(ConfigError, match=r"learner\.train=full"):
-        improved(toy_reviews, train="full").policy.save(tmp_path / "none", adapter=True)
+    with pytest.raises(ConfigError, match=r"learner\.policy\.train=full"):
+        improved(toy_reviews, policy={"train": "full"}).policy.save(tmp_path / "none", adapter=True)
 
 
 @torch.no_grad()
@@ -141,10 +141,16 @@ def test_a_policy_of_half_precision_learns_with_adapters_of_full(toy_reviews: Re
         def model(self) -> Any:
             return toy_reviews.model().to(torch.bfloat16)  # type: ignore[arg-type]
 
-    one = TextLearnerSettings(train="lora", updates=1, prompts=4, responses=4).build(
+    one = TextLearnerSettings(policy=LanguageSettings(train="lora"), updates=1, prompts=4, responses=4).build(
         cast(Any, Half()), np.random.default_rng(0)
     )
     metrics = one.improve(cast("RewardModel[Response]", Long()), NO_STORE, np.random.default_rng(1))
     assert all(p.dtype == torch.float32 for p in one.policy.parameters())
     assert np.isfinite(metrics["grad_norm"])
-    assert LanguagePolicy(toy_reviews, 1.0, 5, Lora(2, "default"), np.random.default_rng(0)).parameters()
+    assert LanguagePolicy(
+        toy_reviews,
+        1.0,
+        5,
+        LanguageSettings(train="lora", lora_rank=2, lora_targets="default"),
+        np.random.default_rng(0),
+    ).parameters()
