@@ -172,7 +172,7 @@ def text(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
     """Responses of the starting policy, to prompts for learning and to prompts for evaluation."""
     from prefrl.policies.language import LanguagePolicy
 
-    policy, rng = LanguagePolicy(task, temperature=1.0, part=64), np.random.default_rng(0)
+    policy, rng = LanguagePolicy(task, temperature=1.0), np.random.default_rng(0)
     drawn = [
         policy.respond(prompts, 4, np.random.default_rng(4))
         for prompts in (task.prompts(case.pool // 4, rng), task.evaluation_prompts(case.tested // 4, rng))

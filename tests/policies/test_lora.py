@@ -150,7 +150,6 @@ def test_a_policy_of_half_precision_learns_with_adapters_of_full(toy_reviews: Re
     assert LanguagePolicy(
         toy_reviews,
         1.0,
-        5,
         LanguageSettings(train="lora", lora_rank=2, lora_targets="default"),
         np.random.default_rng(0),
     ).parameters()
