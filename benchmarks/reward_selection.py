@@ -170,9 +170,10 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
 
 def text(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
     """Responses of the starting policy, to prompts for learning and to prompts for evaluation."""
-    from prefrl.policies.language import LanguagePolicy
+    from prefrl.policies.language import LanguagePolicy, LanguageSettings
 
-    policy, rng = LanguagePolicy(task, temperature=1.0), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
+    policy = LanguagePolicy(task, 1.0, LanguageSettings(), rng)
     drawn = [
         policy.respond(prompts, 4, np.random.default_rng(4))
         for prompts in (task.prompts(case.pool // 4, rng), task.evaluation_prompts(case.tested // 4, rng))

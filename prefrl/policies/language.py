@@ -115,11 +115,7 @@ class LanguagePolicy:
     """
 
     def __init__(
-        self,
-        task: TextTask,
-        temperature: float,
-        settings: LanguageSettings = LanguageSettings(),  # noqa: B008  # frozen
-        rng: np.random.Generator | None = None,
+        self, task: TextTask, temperature: float, settings: LanguageSettings, rng: np.random.Generator
     ) -> None:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
         self.model = task.model()
@@ -130,7 +126,6 @@ class LanguagePolicy:
             return
         from prefrl.policies.lora import add_adapters  # peft takes seconds to load
 
-        rng = rng or np.random.default_rng(0)
         add_adapters(self.model, settings.lora_rank, settings.lora_targets, rng, "learner.policy")
         self.start = self.model
 

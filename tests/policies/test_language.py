@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from prefrl.envs.text import Reviews
-from prefrl.policies.language import LanguagePolicy, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
 
 
 def test_sampled_responses_come_back_token_for_token(toy_reviews: Reviews, rng: np.random.Generator) -> None:
-    policy = LanguagePolicy(toy_reviews, temperature=1.0)
+    policy = LanguagePolicy(toy_reviews, 1.0, LanguageSettings(), rng)
     drawn = policy.respond(toy_reviews.prompts(3, rng), 4, rng)
     again = Responses.of(policy.with_gold(drawn), toy_reviews)
     assert torch.equal(again.mask, drawn.mask)
@@ -29,7 +29,7 @@ def test_sampled_responses_come_back_token_for_token(toy_reviews: Reviews, rng: 
 def test_responses_that_came_as_text_get_a_begin_and_an_end_token_once(
     toy_reviews: Reviews, rng: np.random.Generator
 ) -> None:
-    policy, tokenizer = LanguagePolicy(toy_reviews, temperature=1.0), toy_reviews.tokenizer
+    policy, tokenizer = LanguagePolicy(toy_reviews, 1.0, LanguageSettings(), rng), toy_reviews.tokenizer
     drawn = [r for r in policy.with_gold(policy.respond(toy_reviews.prompts(2, rng), 4, rng)) if r.tokens[-1] == 2]
     texts = [replace(one, tokens=(), prompt_tokens=()) for one in drawn]
     found = Responses.of(texts, toy_reviews)
@@ -41,6 +41,6 @@ def test_responses_that_came_as_text_get_a_begin_and_an_end_token_once(
 
 
 def test_without_a_critic_there_are_no_values(toy_reviews: Reviews, rng: np.random.Generator) -> None:
-    policy = LanguagePolicy(toy_reviews, temperature=1.0)
+    policy = LanguagePolicy(toy_reviews, 1.0, LanguageSettings(), rng)
     with pytest.raises(ValueError, match="has no values"):
         policy.values(policy.respond(toy_reviews.prompts(1, rng), 2, rng))

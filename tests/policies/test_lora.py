@@ -47,7 +47,7 @@ def some(policy: LanguagePolicy, rng: np.random.Generator) -> Responses:
 
 
 def test_the_start_is_the_model_without_its_adapters(toy_reviews: Reviews, rng: np.random.Generator) -> None:
-    whole, one = LanguagePolicy(toy_reviews, 1.0), improved(toy_reviews).policy
+    whole, one = LanguagePolicy(toy_reviews, 1.0, LanguageSettings(), rng), improved(toy_reviews).policy
     drawn = some(whole, rng)
     torch.testing.assert_close(one.start_logp(drawn), whole.start_logp(drawn))
     assert (one.log_prob(drawn)[0] - one.start_logp(drawn)).abs().max() > 0.01
