@@ -113,6 +113,14 @@ def group_normalised(scores: Tensor, eps: float = 1e-4) -> Tensor:
     return torch.where(all_equal(scores)[:, None], 0.0, centred / (std + eps))
 
 
+def batch_scaled(scores: Tensor, eps: float = 1e-4) -> Tensor:
+    """(P, K) scores minus their group's mean, over the (unbiased) std of all of them plus eps: a group in which little
+    differs stays small (Hu et al. 2025, REINFORCE++ with group baselines). Where no score differs all are 0."""
+    known = scores[_known(scores)]
+    spread = known.std() if len(known) > 1 else known.new_zeros(())
+    return torch.where(all_equal(scores)[:, None], 0.0, _centred(scores, 1) / (spread + eps))
+
+
 def batch_centred(scores: Tensor) -> Tensor:
     """(P, K) scores minus the mean of all (REINFORCE with a constant baseline)."""
     return _centred(scores, (0, 1))

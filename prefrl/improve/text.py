@@ -24,6 +24,7 @@ from prefrl.improve.objectives import (
     Reduction,
     all_equal,
     batch_centred,
+    batch_scaled,
     group_normalised,
     kl_k1,
     kl_k3,
@@ -64,9 +65,9 @@ class TextLearnerSettings(Settings):
     """Passes over each batch."""
     minibatches: int = Field(1, ge=1)
     """Gradient steps of a pass."""
-    advantage: Literal["leave_one_out", "group_normalised", "batch_mean"] = "leave_one_out"
-    """What is taken off a response's return: the mean of its prompt's others (RLOO), its group's mean, over the std
-    (GRPO), or the batch's mean (REINFORCE)."""
+    advantage: Literal["leave_one_out", "group_normalised", "batch_scaled", "batch_mean"] = "leave_one_out"
+    """What is taken off a response's return: the mean of its prompt's others (RLOO), its group's mean, over the group's
+    std (GRPO) or the batch's, or the batch's mean (REINFORCE)."""
     clip: float | None = Field(None, gt=0)
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
     beta: float = Field(0.3, ge=0)
@@ -89,6 +90,9 @@ class TextLearnerSettings(Settings):
     """Of sampling while learning and asking, and of every log-probability in the objective."""
     missing_end_penalty: float = Field(1.0, ge=0)
     """Taken off the score of a response that reached the task's most tokens without an end token."""
+    drop_unended: bool = False
+    """Leave responses without an end token out, as if nothing had scored them, in place of the penalty (DAPO, Yu et al.
+    2025)."""
     length_cost: float = 0.0
     """Taken off the score for each token."""
     reward_clip: float | None = Field(None, gt=0)
@@ -197,8 +201,8 @@ class TextLearner:
         settings = self._settings
         found = reward.score(drawn.candidates(self._task.tokenizer))  # (B,)
         raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
-        scored = ~raw.isnan()  # what a reward did not score teaches nothing
-        scores = self._finite("reward", self._shaped(raw, drawn))
+        scored = ~raw.isnan()
+        scores = self._finite("reward", self._shaped(raw, drawn))  # NaN: what was not scored teaches nothing
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
@@ -218,7 +222,7 @@ class TextLearner:
             "ratio_error": steps[0]["ratio_error"],
             "reward": float(raw.nanmean()),
             "reward_std": float(raw[scored].std(correction=0)) if scored.any() else math.nan,
-            "unscored": 1.0 - float(scored.float().mean()),
+            "unscored": float(scores.isnan().float().mean()),
             **(self._distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
             "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
             "length": float(drawn.mask.sum(1).float().mean()),
@@ -275,6 +279,8 @@ class TextLearner:
         """(B,): the scores that are learned from, NaN where there is none."""
         settings = self._settings
         kept = raw if settings.reward_clip is None else raw.clamp(-settings.reward_clip, settings.reward_clip)
+        if settings.drop_unended:
+            kept = torch.where(drawn.ended, kept, math.nan)
         return kept - settings.missing_end_penalty * ~drawn.ended - settings.length_cost * drawn.mask.sum(1)
 
     def _finite(self, name: str, values: Tensor) -> Tensor:
@@ -290,13 +296,15 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
     """(P, K) returns of K responses to each of P prompts -> (P, K) advantages."""
     if how == "leave_one_out":
         return leave_one_out(returns)
-    return group_normalised(returns) if how == "group_normalised" else batch_centred(returns)
+    scaled = {"group_normalised": group_normalised, "batch_scaled": batch_scaled, "batch_mean": batch_centred}
+    return scaled[how](returns)
 
 
 AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
 ADVANTAGES = {
     "leave_one_out": "R_i - mean of the prompt's other R_j",
     "group_normalised": "(R_i - mean of the prompt's R_j) / (their std + 1e-4)",
+    "batch_scaled": "(R_i - mean of the prompt's R_j) / (std of the batch's R + 1e-4)",
     "batch_mean": "R_i - mean of the batch's R_j",
 }
 

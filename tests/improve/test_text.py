@@ -274,7 +274,7 @@ def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Re
         learner(toy_reviews).improve(reward(constant=float("inf")), NO_STORE, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_mean"])
+@pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean"])
 def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
     """As if it had never been drawn: the others learn from one another alone."""
 
@@ -297,6 +297,26 @@ def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Revie
     metrics = nobody.improve(reward(constant=float("nan")), NO_STORE, np.random.default_rng(0))
     assert torch.equal(before, flat(nobody.policy.model))
     assert metrics["unscored"] == 1.0
+
+
+def test_responses_that_did_not_end_can_be_left_out(toy_reviews: Reviews) -> None:
+    """Whatever they were worth: the same is learned."""
+
+    class Worth:
+        unended = 0.0
+
+        def score(self, candidates: Sequence[Response]) -> Floats:
+            ended = [c.tokens[-1] in toy_reviews.ends for c in candidates]
+            return np.array([float(i) if end else self.unended for i, end in enumerate(ended)], np.float32)
+
+    worth, found, metrics = Worth(), [], {}
+    for worth.unended in (0.0, 100.0):
+        one = learner(toy_reviews, beta=0.0, drop_unended=True)
+        metrics = one.improve(cast("RewardModel[Response]", worth), NO_STORE, np.random.default_rng(1))
+        found.append(flat(one.policy.model))
+    assert torch.equal(found[0], found[1])
+    assert metrics["unscored"] == pytest.approx(1 - metrics["ended"])
+    assert 0 < metrics["ended"] < 1
 
 
 def test_a_score_is_cut_before_anything_is_taken_off_it(toy_reviews: Reviews) -> None:
@@ -364,6 +384,10 @@ def test_advantages_by_hand() -> None:
     returns = torch.tensor([[1.0, 3.0], [0.0, 0.0]])
     assert advantages_of(returns, "leave_one_out").tolist() == [[-2.0, 2.0], [0.0, 0.0]]
     assert advantages_of(returns, "batch_mean").tolist() == [[0.0, 2.0], [-1.0, -1.0]]
+    scaled = advantages_of(torch.tensor([[1.0, 3.0], [0.0, 0.1]]), "batch_scaled")
+    std = float(torch.tensor([1.0, 3.0, 0.0, 0.1]).std())
+    torch.testing.assert_close(scaled, torch.tensor([[-1.0, 1.0], [-0.05, 0.05]]) / (std + 1e-4))
+    assert advantages_of(torch.ones(2, 2), "batch_scaled").tolist() == [[0.0, 0.0], [0.0, 0.0]]
     torch.testing.assert_close(
         advantages_of(returns, "group_normalised"), torch.tensor([[-0.7071, 0.7071], [0.0, 0.0]]), atol=1e-3, rtol=0
     )
