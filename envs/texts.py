@@ -161,6 +161,8 @@ def _known(path: Path | None, opening: Opening) -> tuple[dict[str, Mapping[str, 
 
     Raises `ValueError` where a prompt does not fit and is to be refused, and where one has two sets of columns.
     """
+    if path is not None and not path.exists():
+        raise ConfigError(f"task.prompts: no such file or folder: {path}")
     found: dict[str, Mapping[str, Any]] = {}
     counts: Counter[str] = Counter()
     for prompt in read_prompts(path) if path else ():

@@ -33,8 +33,8 @@ class FunctionsSettings(Settings):
 
     kind: Literal["functions"] = "functions"
     functions: tuple[str, ...] = Field(min_length=1)
-    """Names of functions that installed packages bring in the entry-point group `prefrl.reward_functions`, or of those
-    below: `answer` and `sentiment`."""
+    """Their names: `answer`, `sentiment`, or what installed packages bring in the entry-point group
+    `prefrl.reward_functions`."""
     weights: tuple[float, ...] = ()
     """What each counts for; 1 where none are given."""
     _given: dict[str, RewardFunction] = PrivateAttr(default_factory=dict)
@@ -79,8 +79,8 @@ def function_named(name: str) -> RewardFunction:
         return OURS[name]
     if name not in installed():
         raise ConfigError(
-            f"reward.functions: no installed package brings {name!r}; {suggest(name, [*OURS, *installed()])}. One that "
-            "was handed over in Python must be handed over again"
+            f"reward.functions: no installed package brings {name!r}, and one that was handed over in Python must be "
+            f"handed over again; {suggest(name, [*OURS, *installed()])}"
         )
     found: RewardFunction = installed()[name].load()
     return found

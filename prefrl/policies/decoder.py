@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import layer_norm, linear
+from torch.nn.functional import layer_norm, linear, rms_norm
 from transformers import (
     Cache,
     GPT2LMHeadModel,
@@ -168,12 +168,12 @@ class FastDecoder:
         end = self._at + 1
         # (B x G, heads of a group, D) and (B x G, end, D) -> (B x G, heads of a group, end). Nothing in the cache comes
         # later than the query, so padding is all there is to mask.
-        scores = torch.bmm(q, keys[:, :end].transpose(1, 2)).add_(self._bias[:, :, :end])
+        scores = torch.baddbmm(self._bias[:, :, :end], q, keys[:, :end].transpose(1, 2))
         return torch.bmm(scores.softmax(-1), values[:, :end]).view(len(q) // self._plan.groups, -1)  # (B, heads x D)
 
 
 def _root_normed(x: Tensor, eps: float) -> Tensor:
-    return x * torch.rsqrt(x.pow(2).mean(-1, keepdim=True) + eps)
+    return rms_norm(x, x.shape[-1:], eps=eps)
 
 
 def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
