@@ -21,6 +21,7 @@ from prefrl.kinds import only
 from prefrl.types import Fields, Response
 
 EVALUATION_SHARE = 8
+ASKED, ANSWERED = {"role": "user", "content": "Hello"}, {"role": "assistant", "content": "Good morning"}
 Long: TypeAlias = Literal["refuse", "cut", "skip"]
 
 
@@ -86,7 +87,10 @@ def _text(value: Any, name: str) -> str:
         messages.pop()
     if not messages:
         raise ValueError("expected messages with somebody's words to answer, got the assistant's alone")
-    return prompt_text(messages)
+    found = prompt_text(messages)
+    if prompt_messages(found) != messages:
+        raise ValueError('the words of a message read like the start of another turn (a line "Human:", say): reword it')
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,27 +101,33 @@ class Opening:
     chat: bool
     system: str = ""
     """Said before every conversation that has no system prompt of its own; needs a chat template."""
-    context: int | None = None
-    """The most tokens of a prompt; None where there is no bound."""
+    room: int | None = None
+    """The most tokens of a prompt that is to be answered; None where there is no bound."""
     long: Long = "refuse"
     """What happens to longer ones; `cut` leaves their end, behind the begin token."""
 
     def __call__(self, prompt: str) -> tuple[int, ...]:
-        """Raises `ValueError` where the template refuses the turns, and for a prompt that is too long or empty."""
+        """Raises `ValueError` where the template refuses the turns, and for a prompt that is empty.
+
+        Longer prompts than there is room for are cut, or given as they are: a judged response may need less room.
+        """
         ids = self._whole(prompt)
-        if self.context is None or len(ids) <= self.context:
+        if self.room is None or len(ids) <= self.room or self.long != "cut":
             return ids
-        if self.long != "cut":
-            raise ValueError(
-                f"a prompt of {len(ids)} tokens, where {self.context} leave room for the response: set "
-                "task.long_prompts to cut or skip, or lower task.response_tokens"
-            )
         begin = ids[:1] if ids[0] == self.tokenizer.bos_token_id else ()
-        return begin + ids[len(ids) - self.context + len(begin) :]
+        return begin + ids[len(ids) - self.room + len(begin) :]
 
     def fits(self, prompt: str) -> bool:
-        """Whether a prompt is neither refused nor cut."""
-        return self.context is None or len(self._whole(prompt)) <= self.context
+        """Whether there is room for a prompt as it is. Raises `ValueError` where it is to be refused."""
+        length = len(self._whole(prompt))
+        if self.room is None or length <= self.room:
+            return True
+        if self.long == "refuse":
+            raise ValueError(
+                f"a prompt of {length} tokens, where {self.room} leave room for the response: set task.long_prompts to "
+                "cut or skip, or lower task.response_tokens"
+            )
+        return False
 
     def _whole(self, prompt: str) -> tuple[int, ...]:
         ids = self._in_turns(prompt) if self.chat else tuple(self.tokenizer.encode(prompt))
@@ -139,12 +149,10 @@ class Opening:
 
 def check_template(tokenizer: PreTrainedTokenizerBase) -> None:
     """Raise `ConfigError` for a chat template that does not open the assistant's turn, or has two begin tokens."""
-    turns = [{"role": "user", "content": "Hello"}]
-    closed, opened = (
-        str(tokenizer.apply_chat_template(turns, tokenize=False, add_generation_prompt=opened))
-        for opened in (False, True)
-    )
-    if closed == opened:
+    opened = _rendered(tokenizer, [ASKED], add_generation_prompt=True)
+    # Some templates end the user's turn with what opens the other one, and need no prompt: the answer follows at once.
+    follows = _rendered(tokenizer, [ASKED, ANSWERED]).removeprefix(opened).lstrip().startswith(ANSWERED["content"])
+    if opened == _rendered(tokenizer, [ASKED]) and not follows:
         raise ConfigError(
             "task.chat_template: the template has no generation prompt, so that a model could not tell whose turn it "
             "is: mend chat_template.jinja beside the model, or set task.chat_template=false"
@@ -154,10 +162,29 @@ def check_template(tokenizer: PreTrainedTokenizerBase) -> None:
         raise ConfigError("task.chat_template: the template begins with two begin tokens: mend it")
 
 
+def turn_end(tokenizer: PreTrainedTokenizerBase) -> int | None:
+    """The first token that a chat template writes after what the assistant says; None where it writes nothing."""
+    after = _rendered(tokenizer, [ASKED, ANSWERED]).rpartition(ANSWERED["content"])[2]
+    ids = tokenizer.encode(after, add_special_tokens=False) if after else []
+    return ids[0] if ids else None
+
+
+def _rendered(tokenizer: PreTrainedTokenizerBase, turns: list[dict[str, str]], **more: bool) -> str:
+    try:
+        return str(tokenizer.apply_chat_template(turns, tokenize=False, **more))  # type: ignore[arg-type]
+    except (TemplateError, ValueError) as error:
+        raise ConfigError(
+            f"task.chat_template: the template of the model's tokenizer fails on a plain question: {error}; mend it, "
+            "or set task.chat_template=false"
+        ) from error
+
+
 def for_evaluation(prompts: Sequence[str]) -> set[str]:
     """One in eight, by a digest of the words, so that the split is the same in every run; one of two or more."""
-    kept = {prompt for prompt in prompts if is_for_evaluation(prompt)}
-    return kept or ({min(prompts, key=_digest)} if len(set(prompts)) > 1 else set())
+    kept, distinct = {prompt for prompt in prompts if is_for_evaluation(prompt)}, set(prompts)
+    if len(distinct) > 1 and kept in (set(), distinct):
+        return {min(distinct, key=_digest)}
+    return kept
 
 
 def is_for_evaluation(prompt: str) -> bool:

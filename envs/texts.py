@@ -21,7 +21,7 @@ from transformers import (
 )
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts
+from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts, turn_end
 from prefrl.policies.cloning import make_tokenizer
 from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
 from prefrl.types import Floats, Response
@@ -70,7 +70,8 @@ class TextsSettings(Settings):
     def identity(self) -> Self:
         """Without where its prompts come from, and how long responses may be: a reward model hangs on neither."""
         names = ("prompts", "evaluation_prompts", "long_prompts", "response_tokens", "dtype")
-        return self.model_copy(update={name: type(self).model_fields[name].default for name in names})
+        update = {name: type(self).model_fields[name].default for name in names}
+        return self.model_copy(update=update | {"model": self.model and self.model.resolve()})
 
     def build(self) -> Texts:
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
@@ -78,14 +79,14 @@ class TextsSettings(Settings):
         context = _context(model)
         tokens = self.response_tokens or min(RESPONSE_TOKENS, (context or 2 * RESPONSE_TOKENS) // 2)
         opening = self._opening(tokenizer, None if context is None else context - tokens)
-        learning, left_out = _known(self.prompts, opening)
-        kept, skipped = _known(self.evaluation_prompts, opening)
+        learning, left_out = _known(self.prompts, opening, "prompts")
+        kept, skipped = _known(self.evaluation_prompts, opening, "evaluation_prompts")
         own = set(kept) if kept else for_evaluation(list(learning))
         return Texts(
             tokens,
             tokenizer,
             model,
-            _ends(model, tokenizer),
+            _ends(model, tokenizer, opening.chat),
             opening,
             learning | kept,
             tuple(prompt for prompt in learning if prompt not in own),
@@ -102,6 +103,8 @@ class TextsSettings(Settings):
             raise ConfigError(
                 "task.system needs a chat template: the tokenizer has none, or task.chat_template is false"
             )
+        if chat and self.long_prompts == "cut":
+            raise ConfigError("task.long_prompts=cut would cut the chat template open: set it to refuse or skip")
         if chat:
             check_template(tokenizer)
         if room is not None and room < 1:
@@ -156,13 +159,13 @@ def _drawn(prompts: Sequence[str], count: int, rng: np.random.Generator, purpose
     return [prompts[i] for i in rng.integers(len(prompts), size=count)]
 
 
-def _known(path: Path | None, opening: Opening) -> tuple[dict[str, Mapping[str, Any]], tuple[str, ...]]:
+def _known(path: Path | None, opening: Opening, setting: str) -> tuple[dict[str, Mapping[str, Any]], tuple[str, ...]]:
     """The distinct prompts of a file with their columns, in their order, and what people should know of the others.
 
     Raises `ValueError` where a prompt does not fit and is to be refused, and where one has two sets of columns.
     """
     if path is not None and not path.exists():
-        raise ConfigError(f"task.prompts: no such file or folder: {path}")
+        raise ConfigError(f"task.{setting}: no such file or folder: {path}")
     found: dict[str, Mapping[str, Any]] = {}
     counts: Counter[str] = Counter()
     for prompt in read_prompts(path) if path else ():
@@ -192,13 +195,9 @@ def _check_repeated(prompt: Prompt, before: Mapping[str, Any]) -> None:
 def _fits(prompt: Prompt, opening: Opening) -> bool:
     """Whether the model's context has room for it. Raises `ValueError` with its row where such prompts are refused."""
     try:
-        if opening.fits(prompt.text):
-            return True
-        if opening.long == "refuse":
-            opening(prompt.text)  # says why
+        return opening.fits(prompt.text)
     except ValueError as error:
         raise ValueError(f"{prompt.place}: {error}") from None
-    return False
 
 
 def _context(model: PreTrainedModel) -> int | None:
@@ -242,8 +241,11 @@ def _load(path: Path, dtype: Precision) -> tuple[PreTrainedModel, PreTrainedToke
         raise ConfigError(f"task.model: {error}") from error
 
 
-def _ends(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
-    """Every token that ends a response: chat models have two. Raises `ConfigError` where there is none."""
+def _ends(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, chat: bool) -> tuple[int, ...]:
+    """Every token that ends a response: chat models have two. The first is what ends a response that came as text.
+
+    Raises `ConfigError` where there is none.
+    """
     said = model.generation_config.eos_token_id if model.generation_config else None
     given = said if isinstance(said, list) else [said]
     found = dict.fromkeys(int(end) for end in [tokenizer.eos_token_id, *given] if end is not None)
@@ -252,4 +254,5 @@ def _ends(model: PreTrainedModel, tokenizer: PreTrainedTokenizerBase) -> tuple[i
             "task.model: neither the tokenizer nor the generation config has an end token, so that no response could "
             "end: set eos_token in tokenizer_config.json"
         )
-    return tuple(found)
+    first = turn_end(tokenizer) if chat else None  # the end of a turn, which need not be that of a text
+    return tuple(sorted(found, key=lambda end: end != first))

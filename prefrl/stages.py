@@ -194,7 +194,13 @@ def generate(
     """Each prompt of a file with the responses of a run's newest policy, `batch` prompts at a time."""
     from prefrl.envs.prompts import read_prompts
 
-    policy, texts = policy_of(folder), [one.text for one in read_prompts(prompts)]
+    policy, given = policy_of(folder), read_prompts(prompts)
+    for one in given:  # all of them, before the first is answered
+        try:
+            policy.opened(one.text)
+        except ValueError as error:
+            raise ValueError(f"{one.place}: {error}") from None
+    texts = [one.text for one in given]
     how = replace(policy.sampling(sampling.samples, sampling.temperature), top_k=sampling.top_k, top_p=sampling.top_p)
     for start in range(0, len(texts), batch):
         some = texts[start : start + batch]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -44,9 +45,9 @@ class FunctionsSettings(Settings):
         """Settings with functions at hand, which a file cannot hold: a run that goes on must be given them again."""
         named = {str(getattr(f, "__name__", type(f).__name__)): f for f in functions}
         if len(named) < len(functions):
-            raise ConfigError(
-                f"reward functions need names that differ, got {', '.join(f.__name__ for f in functions)}"
-            )
+            raise ConfigError(f"{len(functions)} reward functions need names that differ, got {', '.join(named)}")
+        if taken := sorted(name for name in set(named) & set(OURS) if named[name] is not OURS[name]):
+            raise ConfigError(f"there is a reward function {taken[0]!r} already: give yours another name")
         found = cls(functions=tuple(named), weights=tuple(weights))
         found._given.update(named)
         return found
@@ -180,7 +181,10 @@ def _understood(function: RewardFunction, given: dict[str, list[Any]]) -> dict[s
 
 def _checked(name: str, found: object, candidates: Sequence[Response]) -> list[float]:
     """Numbers, one for each response; None becomes NaN."""
-    values: list[Any] = list(found) if isinstance(found, Iterable) else [found]
+    try:
+        values: list[Any] = list(found)  # type: ignore[call-overload]
+    except TypeError:
+        values = [found]
     if len(values) != len(candidates):
         raise ValueError(
             f"the reward function {name!r} gave {len(values)} values for {len(candidates)} responses: expected one each"
@@ -201,12 +205,19 @@ def _checked(name: str, found: object, candidates: Sequence[Response]) -> list[f
 
 
 def answer(completions: Sequence[Any], answer: Sequence[Any], **_: object) -> list[float | None]:
-    """1 where a response ends with what the column `answer` says, spaces and the last full stop aside; else 0."""
+    """1 where a response ends with what the column `answer` says, as words of its own; else 0; None where it says
+    nothing. Spaces and the last full stop do not count: "It is 4." ends with "4", and neither with "14" nor with "-4".
+    """
     found: list[float | None] = []
     for said, right in zip(completions, answer, strict=True):
-        ending = _text(said).strip().removesuffix(".").rstrip()
-        found.append(None if right is None else float(ending.endswith(str(right).strip())))
+        wanted = "" if right is None else _bare(str(right))
+        ending = re.search(rf"(?<![\w.,-]){re.escape(wanted)}\Z", _bare(_text(said)))
+        found.append(float(ending is not None) if wanted else None)
     return found
+
+
+def _bare(text: str) -> str:
+    return text.strip().removesuffix(".").rstrip()
 
 
 def sentiment(prompts: Sequence[Any], completions: Sequence[Any], **_: object) -> list[float]:

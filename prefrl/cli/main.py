@@ -202,18 +202,21 @@ def generate(
     temperature: Annotated[float, typer.Option(help="0 takes the most probable token.", min=0)] = 1.0,
     top_k: Annotated[int, typer.Option(help="Draw among so many tokens; 0 for all.", min=0)] = 0,
     top_p: Annotated[float, typer.Option(help="Draw among tokens of this share.", min=0, max=1)] = 1.0,
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Have the newest policy of a text run answer prompts; `prefrl label --given` reads what is written."""
     from prefrl import stages
     from prefrl.cli.console import counted, say
     from prefrl.envs.prompts import read_prompts
-    from prefrl.storage.files import write_file
 
+    _refuse(to.exists() and not force, f"{to} is there already: choose another name, or write over it with --force")
     drawn = stages.generate(folder, prompts, stages.Drawn(samples, temperature, top_k, top_p))
     total = len(read_prompts(prompts))
-    rows = [{"prompt": prompt, "responses": found} for prompt, found in counted(drawn, total, "prompts")]
-    write_file(to, "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows).encode())
-    say(f"{len(rows)} prompts answered in {to}")
+    to.unlink(missing_ok=True)
+    for prompt, found in counted(drawn, total, "prompts"):
+        with to.open("a", encoding="utf-8") as file:  # line by line: what was written stays, whatever comes
+            file.write(json.dumps({"prompt": prompt, "responses": found}, ensure_ascii=False) + "\n")
+    say(f"{total} prompts answered in {to}")
 
 
 @app.command()

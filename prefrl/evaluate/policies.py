@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import segment
-from prefrl.types import Evaluation, Response, Segment
+from prefrl.types import Evaluation, Floats, Response, Segment
 
 if TYPE_CHECKING:  # a control learner loads no transformers
     from prefrl.policies.language import LanguagePolicy
@@ -50,20 +51,27 @@ def responses(
     task = policy.task
     drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, policy.sampling(1, temperature=1.0))
     found = policy.with_gold(drawn)
-    gold = np.array([r.gold for r in found], float)
+    gold, scores = np.array([r.gold for r in found], float), reward.score(found)
     metrics = {
         "gold": float(gold.mean()),
         "gold_std": float(gold.std()),
-        "learned": float(reward.score(found).mean()),
+        "learned": _mean(scores),
         "kl": float((drawn.logp - policy.start_logp(drawn, temperature=1.0)).sum(1).mean()),
         "length": float(drawn.mask.sum(1).float().mean()),
         "ended": float(drawn.ended.float().mean()),
     }
+    if np.isnan(scores).any():
+        metrics["unscored"] = float(np.isnan(scores).mean())
     words = [one.text.split() for one in found]
     metrics |= {f"distinct_{n}": distinct(words, n) for n in (1, 2)}
     fluent = task.fluency(found)
     metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
     return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count
+
+
+def _mean(scores: Floats) -> float:
+    """Of the responses that were scored; NaN where none was."""
+    return float(scores[~np.isnan(scores)].mean()) if not np.isnan(scores).all() else math.nan
 
 
 def distinct(texts: Sequence[Sequence[str]], n: int) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -182,7 +183,7 @@ class TextLearner:
             self._updates += 1
             if self._settings.kl_stop is not None and measured["kl"] > self._settings.kl_stop:
                 break
-        means = {name: float(np.mean(values)) for name, values in seen.items()}
+        means = {name: _mean(values) for name, values in seen.items()}
         return means | {"ratio_error": max(seen["ratio_error"]), "updates": float(len(seen["ratio_error"]))}
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
@@ -209,7 +210,8 @@ class TextLearner:
         # (B,): one return a response, so the KL is in it before the baseline is taken off.
         returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
         groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
-        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kl)
+        kls = torch.where(scores.isnan(), math.nan, kl.sum(1)).view_as(groups)
+        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
         batch = Batch(drawn, drawn.logp, advantages.view(-1, 1))  # (B, 1): the same for all tokens
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
@@ -244,8 +246,8 @@ class TextLearner:
         settings = self._settings
         return Objective(clip=settings.clip, reduction=settings.reduction, max_grad_norm=settings.max_grad_norm)
 
-    def _kl_advantages(self, kl: Tensor) -> Tensor | float:
-        """(P, K): what the KL (B, L) takes off the advantages of responses, where it is not in the reward.
+    def _kl_advantages(self, kls: Tensor) -> Tensor | float:
+        """(P, K): what the KL of each response takes off its advantage, where it is not in the reward.
 
         With the same baseline, so that at the optimum of reward minus beta x KL both cancel in each sample.
         """
@@ -253,7 +255,7 @@ class TextLearner:
         if settings.kl_in == "reward" or not settings.beta:
             return 0.0
         baseline = "batch_mean" if settings.advantage == "batch_mean" else "leave_one_out"
-        return self._kl.beta * advantages_of(kl.sum(1).view(-1, settings.responses), baseline)
+        return self._kl.beta * advantages_of(kls, baseline)
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
         """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
@@ -292,6 +294,12 @@ class TextLearner:
         return values
 
 
+def _mean(values: Sequence[float]) -> float:
+    """Of the batches in which it is defined."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
 def advantages_of(returns: Tensor, how: str) -> Tensor:
     """(P, K) returns of K responses to each of P prompts -> (P, K) advantages."""
     if how == "leave_one_out":
@@ -316,15 +324,24 @@ def text_formula(settings: TextLearnerSettings) -> str:
         gain = f"min(r A_i, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) A_i)"
     kl = f"{settings.beta:g}" + (f" (steered to {settings.kl_target:g} nats)" if settings.kl_target else "")
     apart = "sum_t [log pi_old(y_t) - log ref(y_t)]"
-    beside = f" - {kl} (K_i - mean of the other K_j),  K_i = {apart}"
+    others = "the batch's" if settings.advantage == "batch_mean" else "the prompt's other"
+    beside = f" - {kl} (K_i - mean of {others} K_j),  K_i = {apart}"
     after = beside if settings.beta and settings.kl_in == "advantage" else ""
     in_reward = f" - {kl} {apart}" if settings.beta and not after else ""
     lines = [
         f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
         *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
         f"A_i = {ADVANTAGES[settings.advantage]}{after}",
-        f"R_i = score(y_i) - {settings.missing_end_penalty:g} [no end token]{in_reward}",
+        f"R_i = {_score(settings)}{in_reward}",
         f"{settings.prompts} prompts x {settings.responses} responses a batch, "
         f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",
     ]
     return "\n".join(lines)
+
+
+def _score(settings: TextLearnerSettings) -> str:
+    """What is learned from of a response's score."""
+    score = "score(y_i)" if settings.reward_clip is None else f"clip(score(y_i), +-{settings.reward_clip:g})"
+    cost = f" - {settings.length_cost:g} tokens(y_i)" if settings.length_cost else ""
+    end = "" if settings.drop_unended else f" - {settings.missing_end_penalty:g} [no end token]"
+    return score + end + cost + (", of responses with an end token alone" if settings.drop_unended else "")

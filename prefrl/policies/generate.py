@@ -182,6 +182,7 @@ def _narrowed(logits: Tensor, sampling: Sampling) -> Tensor:
         share = ordered.softmax(1)
         # What stands before a token must leave room for it: the most probable one always stays.
         gone = share.cumsum(1) - share >= sampling.top_p
+        gone[:, 0] = False
         logits = logits.masked_fill(gone.scatter(1, order, gone), -torch.inf)
     return logits
 

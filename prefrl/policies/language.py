@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
-from transformers import PreTrainedModel, PreTrainedTokenizerBase
+from transformers import GenerationConfig, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import Settings
 from prefrl.policies.exact import check_exact, rows_of_embedding
@@ -102,7 +102,7 @@ class LanguageSettings(Settings):
     lora_targets: Literal["all-linear", "default"] = "all-linear"
     """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
     chunk: int = Field(64, ge=2)
-    """Responses in one pass of a network: changes memory and speed, and nothing else but rounding."""
+    """Responses in one pass of a network while learning: changes memory and speed, and nothing else but rounding."""
 
 
 class LanguagePolicy:
@@ -154,13 +154,19 @@ class LanguagePolicy:
 
         `sampling`: otherwise than by the policy's own temperature.
         """
-        encoded = [self.task.encode(prompt) for prompt in prompts]
+        encoded = [self.opened(prompt) for prompt in prompts]
         sampling = sampling or self.sampling(samples)
         drawn = generate(self.model, encoded, sampling, generator(rng))
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
         return Responses(texts, ids, drawn.tokens, drawn.mask, drawn.logp, drawn.ended)
+
+    def opened(self, prompt: str) -> tuple[int, ...]:
+        """The tokens that the model goes on from. Raises `ValueError` where its context has no room for a response."""
+        ids = self.task.encode(prompt)
+        self._check_room(len(ids) + self.task.response_tokens)
+        return ids
 
     def sampling(self, samples: int, temperature: float | None = None) -> Sampling:
         """How the raw policy draws K responses to a prompt, at its own temperature unless another is given."""
@@ -169,6 +175,7 @@ class LanguagePolicy:
 
     def start_logp(self, responses: Responses, temperature: float | None = None) -> Tensor:
         """(B, L) log-probabilities under the starting policy, without gradients."""
+        self._check_room(int(responses.lengths().max()))
         temperature = self.temperature if temperature is None else temperature
         with self._at_the_start():
             return all_logp(self.start, responses, temperature, self.part, self._head_alone)
@@ -195,6 +202,14 @@ class LanguagePolicy:
             if found is None or found.shape != parameter.shape:
                 raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
             parameter.copy_(found)  # in place: the optimiser holds these very tensors
+
+    def _check_room(self, tokens: int) -> None:
+        context = getattr(self.model.config, "max_position_embeddings", None)  # some architectures have no bound
+        if context is not None and tokens > context:
+            raise ValueError(
+                f"a prompt and its response need up to {tokens} tokens, and the model's context has {context}: leave "
+                "that prompt out, or lower task.response_tokens"
+            )
 
     def _trained(self) -> dict[str, torch.nn.Parameter]:
         """By name. Tied weights have one name here."""
@@ -274,10 +289,10 @@ def save_model(model: PreTrainedModel, task: TextTask, folder: Path, adapter: bo
 
             save_adapters(model, work)
         else:
-            whole = merged_of(model)
-            if whole.generation_config is not None:
-                whole.generation_config.eos_token_id = list(task.ends)
-            whole.save_pretrained(work)
+            merged_of(model).save_pretrained(work)
+            # Its own: sampling was from the raw policy, and what others set as defaults transformers may not even save.
+            special = {"eos_token_id": list(task.ends), "pad_token_id": task.tokenizer.pad_token_id}
+            GenerationConfig(**special).save_pretrained(work)  # type: ignore[no-untyped-call]
         task.tokenizer.save_pretrained(work)
 
 

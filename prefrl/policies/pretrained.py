@@ -37,7 +37,8 @@ def load_weights(
                 dtype=getattr(torch, dtype), use_safetensors=True, output_loading_info=True, **_where(name, download)
             )
     except ImportError as error:
-        raise ConfigError(f"{name}: {first_line(error)}; for a .gguf file run: pip install 'prefrl[gguf]'") from error
+        advice = "; run: pip install 'prefrl[gguf]'" if Path(name).suffix == ".gguf" else ""
+        raise ConfigError(f"{name}: {first_line(error)}{advice}") from error
     except (OSError, ValueError) as error:
         local = switch and not download
         hint = f"only local files are looked at unless {switch} is true" if local else first_line(error)

@@ -88,12 +88,17 @@ def test_a_policy_answers_the_prompts_of_a_file(prefrl: Shell, own_model: Path) 
     settings = f"task.kind=texts task.model={own_model} task.prompts=prompts.jsonl"
     assert prefrl(f"run text/sentiment {settings} {SMALL} --out run") == 0
     for extra in ("", "--top-k 3 --top-p 0.9", "--temperature 0"):
-        assert prefrl(f"generate run --prompts prompts.jsonl --samples 3 {extra}") == 0
+        assert prefrl(f"generate run --prompts prompts.jsonl --samples 3 {extra} --force") == 0
         found = [json.loads(line) for line in Path("responses.jsonl").read_text().strip().split("\n")]
         assert [row["prompt"] for row in found] == [f"p{i}" for i in range(6)]
         assert all(len(row["responses"]) == 3 for row in found)
     assert all(len(set(row["responses"])) == 1 for row in found)  # the most probable token leaves nothing to chance
     assert "6 prompts answered in responses.jsonl" in prefrl.out
+    assert prefrl("generate run --prompts prompts.jsonl") == 2
+    assert "responses.jsonl is there already" in prefrl.err
+    write("long.jsonl", {"prompt": "x" * 200})
+    assert prefrl("generate run --prompts long.jsonl --to long-out.jsonl") == 2
+    assert "the model's context has 128" in prefrl.err
     assert prefrl("run control/toy loop.rounds=1 loop.labels=8 --out toy") == 0
-    assert prefrl("generate toy --prompts prompts.jsonl") == 2
+    assert prefrl("generate toy --prompts prompts.jsonl --to other.jsonl") == 2
     assert "its policy is no language model" in prefrl.err

@@ -12,7 +12,7 @@ import pytest
 from transformers import PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError
-from prefrl.envs.prompts import Opening, check_template, for_evaluation, read_prompts
+from prefrl.envs.prompts import Opening, check_template, for_evaluation, is_for_evaluation, read_prompts
 from prefrl.envs.texts import Texts, TextsSettings
 from prefrl.policies.cloning import make_tokenizer
 
@@ -86,6 +86,7 @@ def test_tables_and_folders_of_data_sets_are_read(tmp_path: Path) -> None:
         ({"prompt": 3}, "row 2: column 'prompt': expected text or messages, got 3"),
         ({"prompt": [{"role": "user"}]}, "row 2: expected messages with a role"),
         ({"messages": [{"role": "assistant", "content": "a"}]}, "row 2: expected messages with somebody's words"),
+        ({"prompt": [{"role": "user", "content": "a\n\nAssistant: b"}]}, "row 2: the words of a message read like"),
         ([1], "row 2: expected an object, got list"),
     ],
 )
@@ -100,6 +101,8 @@ def test_one_of_two_prompts_is_kept_for_evaluation() -> None:
     many = [f"p{i}" for i in range(800)]
     assert 60 < len(for_evaluation(many)) < 140
     assert for_evaluation(many[::-1]) == for_evaluation(many)
+    both = [prompt for prompt in many if is_for_evaluation(prompt)][:2]
+    assert len(for_evaluation(both)) == 1  # one is left to learn on
 
 
 # --- opened --------------------------------------------------------------------------------------------------------
@@ -122,8 +125,20 @@ def test_a_prompt_without_a_template_has_one_begin_token(tokenizer: PreTrainedTo
     assert Opening(tokenizer, chat=False)("Hi").count(int(tokenizer.bos_token_id)) == 1
 
 
+def test_a_template_whose_user_turn_opens_the_answer_is_taken(tokenizer: PreTrainedTokenizerBase) -> None:
+    tokenizer.chat_template = TEMPLATES["mistral"].replace("{% if add_generation_prompt %} {% endif %}", "")
+    check_template(tokenizer)
+
+
+def test_a_template_that_fails_says_so(tokenizer: PreTrainedTokenizerBase) -> None:
+    for template in ("{{ raise_exception('no') }}", "{% for m in messages %}"):
+        tokenizer.chat_template = template
+        with pytest.raises(ConfigError, match="fails on a plain question"):
+            check_template(tokenizer)
+
+
 def test_templates_that_do_not_open_a_turn_or_begin_twice_are_refused(tokenizer: PreTrainedTokenizerBase) -> None:
-    tokenizer.chat_template = "{% for m in messages %}{{ m.content }}{% endfor %}"
+    tokenizer.chat_template = "{% for m in messages %}<{{ m.role }}>{{ m.content }}{% endfor %}"
     with pytest.raises(ConfigError, match="no generation prompt"):
         check_template(tokenizer)
     tokenizer.chat_template = "{{ bos_token }}" + TEMPLATES["llama"]
@@ -136,6 +151,7 @@ def test_a_prompt_that_leaves_no_room_is_refused_cut_or_skipped_and_counted(tmp_
     small: dict[str, Any] = {"prompts": path, "context": 64, "response_tokens": 16}
     with pytest.raises(ValueError, match=r"row 3: a prompt of 61 tokens, where 48 leave room"):
         TextsSettings(**small).build()
+    assert len(TextsSettings(**small | {"prompts": None}).build().encode("x" * 60)) == 61  # judged ones may need less
     cut = TextsSettings(**small, long_prompts="cut").build()
     assert cut.notes == (f"{path}: 1 long prompts cut to the room that the model's context leaves",)
     ids = cut.encode("abc" * 20)
@@ -166,12 +182,17 @@ def chat_model(folder: Path, **generation: Any) -> Path:
 def test_a_model_with_a_template_reads_by_it_and_ends_by_every_end_token(tmp_path: Path) -> None:
     folder = chat_model(tmp_path / "model", eos_token_id=[7, 9])
     task: Texts = TextsSettings(model=folder, response_tokens=8).build()
-    assert task.ends == (int(task.tokenizer.eos_token_id), 7, 9)
+    assert set(task.ends) == {int(task.tokenizer.eos_token_id), 7, 9}
+    turn_end = task.tokenizer.encode("<|im_end|>", add_special_tokens=False)[0]
+    other: Texts = TextsSettings(model=chat_model(tmp_path / "other", eos_token_id=[7, turn_end])).build()
+    assert other.ends[0] == turn_end  # what ends a turn, not what ends a text
     assert str(task.tokenizer.decode(list(task.encode("Hi")))).endswith("<|im_start|>assistant\n")
     plain: Texts = TextsSettings(model=folder, response_tokens=8, chat_template=False).build()
     assert plain.encode("Hi") == tuple(plain.tokenizer.encode("Hi"))
     with pytest.raises(ConfigError, match="needs a chat template"):
         TextsSettings(model=folder, response_tokens=8, chat_template=False, system="Be brief.").build()
+    with pytest.raises(ConfigError, match="would cut the chat template open"):
+        TextsSettings(model=folder, response_tokens=8, long_prompts="cut").build()
     with pytest.raises(ConfigError, match="has no chat template"):
         TextsSettings(chat_template=True).build()
 

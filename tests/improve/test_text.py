@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -274,6 +275,22 @@ def test_a_reward_that_is_not_finite_names_itself_and_the_update(toy_reviews: Re
         learner(toy_reviews).improve(reward(constant=float("inf")), NO_STORE, np.random.default_rng(0))
 
 
+def test_an_evaluation_is_over_what_was_scored(toy_reviews: Reviews) -> None:
+    class Some:
+        def score(self, candidates: Sequence[Response]) -> Floats:
+            return np.array([2.0 if i % 4 else np.nan for i in range(len(candidates))], np.float32)
+
+    found = learner(toy_reviews).evaluate(cast("RewardModel[Response]", Some()), np.random.default_rng(0)).metrics
+    assert (found["learned"], found["unscored"]) == (2.0, 0.25)
+
+
+def test_the_kl_does_not_teach_by_what_was_not_scored(toy_reviews: Reviews) -> None:
+    """However far such a response is from the start: it has no advantage, and is in no baseline."""
+    one = learner(toy_reviews, algorithm="grpo")
+    kls = torch.tensor([[0.0, 0.0, 0.0, math.nan]])
+    assert torch.equal(torch.as_tensor(one._kl_advantages(kls)), torch.zeros(1, 4))
+
+
 @pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean"])
 def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
     """As if it had never been drawn: the others learn from one another alone."""
@@ -401,8 +418,14 @@ def test_the_formula_says_what_the_settings_say() -> None:
     other = TextLearnerSettings(
         clip=0.2, epochs=2, kl_in="advantage", beta=0.1, reduction="sequence", advantage="group_normalised"
     )
-    assert "their std + 1e-4) - 0.1 (K_i - mean of the other K_j),  K_i = sum_t" in other.formula()
+    assert "their std + 1e-4) - 0.1 (K_i - mean of the prompt's other K_j),  K_i = sum_t" in other.formula()
     assert "ref" not in text_formula(TextLearnerSettings(beta=0.0))
+
+
+def test_the_formula_says_what_is_done_to_a_score() -> None:
+    shaped = text_formula(TextLearnerSettings(drop_unended=True, length_cost=0.1, reward_clip=2.0, beta=0.0))
+    assert "R_i = clip(score(y_i), +-2) - 0.1 tokens(y_i), of responses with an end token alone" in shaped
+    assert "the batch's K_j" in text_formula(TextLearnerSettings(advantage="batch_mean", kl_in="advantage"))
 
 
 def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> None:

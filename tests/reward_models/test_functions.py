@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -74,6 +75,7 @@ def test_several_functions_are_added_by_weight_and_none_is_not_zero(task: Texts)
     [
         ([1.0], "'wrong' gave 1 values for 2 responses"),
         (3.0, "'wrong' gave 1 values for 2 responses"),
+        (np.array(3.0), "'wrong' gave 1 values for 2 responses"),
         (["good", 1.0], "'wrong': expected numbers or None"),
         ([math.inf, 1.0], "'wrong' gave inf for 'a'"),
     ],
@@ -100,7 +102,9 @@ def test_our_own_functions_score_answers_and_sentiment(task: Texts) -> None:
     found = reward.score([Response(prompt, text) for prompt, text in texts])
     assert found[:3].tolist() == [1.0, 0.0, 1.0]
     assert np.isnan(found[3])
-    assert answer(["x"], [None]) == [None]
+    assert answer(["x", "x"], [None, ""]) == [None, None]
+    said = ["It is 12.", "-2", "1.2", "See U.S.", "It is (2)", "2"]
+    assert answer(said, ["2", "2", "2", "U.S.", "(2)", 2]) == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
     good, bad = sentiment(["", ""], ["What a wonderful film!", [{"role": "assistant", "content": "Awful."}]])
     assert good > 0 > bad
 
@@ -111,7 +115,11 @@ def test_names_are_looked_up_and_misspelt_ones_get_a_hint(task: Texts) -> None:
     with pytest.raises(ValidationError, match="2 functions have 1 weights"):
         FunctionsSettings(functions=("answer", "sentiment"), weights=(1.0,))
     with pytest.raises(ConfigError, match="names that differ"):
-        FunctionsSettings.of(answer, answer)
+        FunctionsSettings.of(partial(answer), partial(sentiment))
+    mine = partial(answer)
+    cast(Any, mine).__name__ = "answer"
+    with pytest.raises(ConfigError, match="'answer' already"):
+        FunctionsSettings.of(mine)
 
 
 def test_settings_with_functions_at_hand_are_the_same_by_name() -> None:
