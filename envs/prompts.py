@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -30,7 +30,7 @@ class Prompt(NamedTuple):
 
     text: str
     """As it is, or the transcript of a conversation."""
-    columns: Mapping[str, Any]
+    columns: Fields
     """What else its row says."""
     place: str
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +17,7 @@ from prefrl.envs.grammar import Grammar
 from prefrl.envs.prompts import is_for_evaluation
 from prefrl.envs.reviews import reviews, source
 from prefrl.policies.cloning import CloningSettings
-from prefrl.types import Floats, Response
+from prefrl.types import Fields, Floats, Response
 
 SHIPPED = Path(__file__).parent / "starts" / "reviews"
 """The starting policy of the default settings; `benchmarks/start_reviews.py` makes it."""
@@ -68,7 +68,7 @@ class Reviews:
     def encode(self, prompt: str) -> tuple[int, ...]:
         return tuple(self.tokenizer.encode(prompt))
 
-    def columns(self, prompt: str) -> Mapping[str, Any]:
+    def columns(self, prompt: str) -> Fields:
         return {}
 
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts, turn_end
 from prefrl.policies.cloning import make_tokenizer
 from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
-from prefrl.types import Floats, Response
+from prefrl.types import Fields, Floats, Response
 
 RESPONSE_TOKENS = 256
 ONLY_BYTES = 259
@@ -124,7 +124,7 @@ class Texts:
     start: PreTrainedModel
     ends: tuple[int, ...]
     encode: Opening
-    known: Mapping[str, Mapping[str, Any]]
+    known: Mapping[str, Fields]
     """Distinct prompts, and what else their rows say; none where there is no file of them."""
     learning: tuple[str, ...]
     evaluating: tuple[str, ...]
@@ -135,7 +135,7 @@ class Texts:
     def model(self) -> PreTrainedModel:
         return copy.deepcopy(self.start)
 
-    def columns(self, prompt: str) -> Mapping[str, Any]:
+    def columns(self, prompt: str) -> Fields:
         return self.known.get(prompt, {})
 
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:
@@ -159,14 +159,14 @@ def _drawn(prompts: Sequence[str], count: int, rng: np.random.Generator, purpose
     return [prompts[i] for i in rng.integers(len(prompts), size=count)]
 
 
-def _known(path: Path | None, opening: Opening, setting: str) -> tuple[dict[str, Mapping[str, Any]], tuple[str, ...]]:
+def _known(path: Path | None, opening: Opening, setting: str) -> tuple[dict[str, Fields], tuple[str, ...]]:
     """The distinct prompts of a file with their columns, in their order, and what people should know of the others.
 
     Raises `ValueError` where a prompt does not fit and is to be refused, and where one has two sets of columns.
     """
     if path is not None and not path.exists():
         raise ConfigError(f"task.{setting}: no such file or folder: {path}")
-    found: dict[str, Mapping[str, Any]] = {}
+    found: dict[str, Fields] = {}
     counts: Counter[str] = Counter()
     for prompt in read_prompts(path) if path else ():
         if prompt.text in found:
@@ -181,7 +181,7 @@ def _known(path: Path | None, opening: Opening, setting: str) -> tuple[dict[str,
     return found, tuple(f"{path}: {count} long prompts {done[how]}" for how, count in counts.items())
 
 
-def _check_repeated(prompt: Prompt, before: Mapping[str, Any]) -> None:
+def _check_repeated(prompt: Prompt, before: Fields) -> None:
     if prompt.columns != before:
         names = [n for n in {**before, **prompt.columns} if before.get(n) != prompt.columns.get(n)]
         judged = {"chosen", "rejected", "completion", "label", "responses", "margin"}

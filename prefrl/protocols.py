@@ -14,7 +14,7 @@ from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Judged
 from prefrl.kinds import RESPONSES, SEGMENTS
 from prefrl.seeding import Device
-from prefrl.types import Bools, C, C_contra, Evaluation, Floats, Metrics, Query, Response, Segment, State, Steps
+from prefrl.types import Bools, C, C_contra, Evaluation, Fields, Floats, Metrics, Query, Response, Segment, State, Steps
 
 if TYPE_CHECKING:
     import torch
@@ -167,7 +167,7 @@ class TextTask(Task, Protocol):
     def encode(self, prompt: str) -> tuple[int, ...]:
         """The tokens of a prompt that the policy goes on from: with one begin token, or in its chat template."""
 
-    def columns(self, prompt: str) -> Mapping[str, Any]:
+    def columns(self, prompt: str) -> Fields:
         """What else is known of a prompt, a correct answer say: for reward functions."""
 
     def prompts(self, count: int, rng: np.random.Generator) -> list[str]:

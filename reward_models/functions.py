@@ -26,6 +26,9 @@ from prefrl.protocols import Task, TextTask, text
 from prefrl.types import Floats, Response, State
 
 RewardFunction: TypeAlias = Callable[..., Sequence[float | None]]
+Arguments: TypeAlias = dict[str, list[Any]]
+Turns: TypeAlias = Any
+"""Text, or a list of messages."""
 UNFIT = "reward functions are not fitted: set loop.labels=0, or choose a reward model"
 
 
@@ -152,7 +155,7 @@ class FunctionReward:
             raise ValueError(f"the reward function {name!r} failed: {type(error).__name__}: {error}") from error
         return _checked(name, found, candidates)
 
-    def _arguments(self, candidates: Sequence[Response]) -> dict[str, list[Any]]:
+    def _arguments(self, candidates: Sequence[Response]) -> Arguments:
         turns = [prompt_messages(one.prompt) for one in candidates]
         columns = [self.task.columns(one.prompt) for one in candidates]
         names = dict.fromkeys(name for row in columns for name in row)
@@ -164,11 +167,11 @@ class FunctionReward:
         }
 
 
-def _completion(response: Response, conversation: bool) -> Any:
+def _completion(response: Response, conversation: bool) -> Turns:
     return [{"role": "assistant", "content": response.text}] if conversation else response.text
 
 
-def _understood(function: RewardFunction, given: dict[str, list[Any]]) -> dict[str, list[Any]]:
+def _understood(function: RewardFunction, given: Arguments) -> Arguments:
     """The arguments that a function has names for; all where it takes any."""
     try:
         parameters = inspect.signature(function).parameters
@@ -204,7 +207,7 @@ def _checked(name: str, found: object, candidates: Sequence[Response]) -> list[f
 # --- functions of our own -----------------------------------------------------------------------------------------
 
 
-def answer(completions: Sequence[Any], answer: Sequence[Any], **_: object) -> list[float | None]:
+def answer(completions: Sequence[Turns], answer: Sequence[Turns], **_: object) -> list[float | None]:
     """1 where a response ends with what the column `answer` says, as words of its own; else 0; None where it says
     nothing. Spaces and the last full stop do not count: "It is 4." ends with "4", and neither with "14" nor with "-4".
     """
@@ -220,7 +223,7 @@ def _bare(text: str) -> str:
     return text.strip().removesuffix(".").rstrip()
 
 
-def sentiment(prompts: Sequence[Any], completions: Sequence[Any], **_: object) -> list[float]:
+def sentiment(prompts: Sequence[Turns], completions: Sequence[Turns], **_: object) -> list[float]:
     """VADER's compound score of a response, in [-1, 1] (Hutto and Gilbert 2014)."""
     from vaderSentiment.vaderSentiment import SentimentIntensityAnalyzer
 
@@ -228,7 +231,7 @@ def sentiment(prompts: Sequence[Any], completions: Sequence[Any], **_: object) -
     return [float(vader.polarity_scores(_text(said))["compound"]) for said in completions]
 
 
-def _text(completion: Any) -> str:
+def _text(completion: Turns) -> str:
     return completion if isinstance(completion, str) else "".join(str(turn["content"]) for turn in completion)
 
 

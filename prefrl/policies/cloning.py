@@ -97,8 +97,7 @@ class CloningSettings(Settings):
         """Write the model in half precision, to be installed with the package: 2 MB, and the same on every machine."""
         model, tokenizer = self.build(write, source)
         with whole_folder(folder) as work, quiet():
-            half: Any = copy.deepcopy(model).to(torch.float16)  # type: ignore[arg-type]  # transformers wraps it
-            half.save_pretrained(work)
+            copy.deepcopy(model).to(torch.float16).save_pretrained(work)  # type: ignore[arg-type]  # transformers wraps it
             tokenizer.save_pretrained(work)
             (work / RECIPE_FILE).write_text(json.dumps(self.recipe(source)))
 

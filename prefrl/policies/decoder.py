@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -25,6 +25,9 @@ from transformers import (
     Qwen3ForCausalLM,
 )
 
+Module: TypeAlias = Any
+"""A part of a model of transformers, whose parts have no types."""
+
 
 @dataclass(frozen=True)
 class Affine:
@@ -37,7 +40,7 @@ class Affine:
     def __call__(self, x: Tensor) -> Tensor:
         return linear(x, self.weight, self.bias)
 
-    def after(self, norm: Any) -> Affine:
+    def after(self, norm: Module) -> Affine:
         """The same on what a norm gives before its own weight n and bias c: W (n x + c) + b = (W n) x + (W c + b)."""
         shift = getattr(norm, "bias", None)  # an RMS norm has none
         bias = self.bias if shift is None else self.weight @ shift + (0.0 if self.bias is None else self.bias)
@@ -77,7 +80,7 @@ class Plan:
     head: Affine
     places: Tensor | None = None
     """(T, d) learned positions, or None where positions turn queries and keys."""
-    rotary: Any = None
+    rotary: Module = None
 
 
 def plan(model: PreTrainedModel, length: int) -> Plan | None:
@@ -85,7 +88,7 @@ def plan(model: PreTrainedModel, length: int) -> Plan | None:
     make = PLANS.get(type(model))  # a subclass may compute something else
     if make is None or model.dtype != torch.float32:
         return None
-    config: Any = model.config
+    config: Module = model.config
     rope = getattr(config, "rope_parameters", None) or {"rope_type": "default"}
     window = getattr(config, "sliding_window", None)
     if rope.get("rope_type", "default") != "default" or (window is not None and length > window):
@@ -185,7 +188,7 @@ def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.cat([turned, rest], -1) if rest.shape[-1] else turned
 
 
-def _roomy(layer: Any, samples: int, room: int) -> tuple[Tensor, Tensor]:
+def _roomy(layer: Module, samples: int, room: int) -> tuple[Tensor, Tensor]:
     """A layer's (P, G, T, D) keys and values -> (P x K x G, T + room, D), each prompt's repeated for its samples."""
     found = []
     for x in (layer.keys, layer.values):
@@ -206,9 +209,9 @@ def _bias(mask: Tensor, groups: int, samples: int, room: int, dtype: torch.dtype
 # --- the shapes ----------------------------------------------------------------------------------------------------
 
 
-def affine(layer: Any) -> Affine:
+def affine(layer: Module) -> Affine:
     """A linear layer, the products of its adapters added. GPT-2's keep their matrix the other way round."""
-    base = dict(layer.named_children()).get("base_layer", layer)  # peft's layer around a linear one has it
+    base: Module = dict(layer.named_children()).get("base_layer", layer)  # peft's layer around a linear one has it
     weight = base.weight
     if base is not layer and not layer.disable_adapters:
         weight = weight + sum(layer.get_delta_weight(name) for name in layer.active_adapters)
@@ -226,7 +229,7 @@ def scaled(part: Affine, by: float) -> Affine:
     return Affine(part.weight * by, None if part.bias is None else part.bias * by)
 
 
-def _llama(model: Any) -> Plan:
+def _llama(model: Module) -> Plan:
     """Llama, Mistral, Qwen 2 and Qwen 3, which differ in biases and in norms over the heads."""
     config, inner = model.config, model.model
     return Plan(
@@ -244,7 +247,7 @@ def _llama(model: Any) -> Plan:
     )
 
 
-def _llama_layer(layer: Any) -> Layer:
+def _llama_layer(layer: Module) -> Layer:
     attention, mlp = layer.self_attn, layer.mlp
     norms = (attention.q_norm.weight * attention.scaling, attention.k_norm.weight) if _norms_heads(attention) else None
     q = affine(attention.q_proj)
@@ -258,7 +261,7 @@ def _norms_heads(attention: torch.nn.Module) -> bool:
     return "q_norm" in dict(attention.named_children())
 
 
-def _phi(model: Any) -> Plan | None:
+def _phi(model: Module) -> Plan | None:
     config, inner = model.config, model.model
     if config.qk_layernorm:
         return None
@@ -277,14 +280,14 @@ def _phi(model: Any) -> Plan | None:
     )
 
 
-def _phi_layer(layer: Any) -> Layer:
+def _phi_layer(layer: Module) -> Layer:
     attention, norm = layer.self_attn, layer.input_layernorm
     q, k, v = (affine(attention.get_submodule(name)) for name in ("q_proj", "k_proj", "v_proj"))
     qkv = fused(scaled(q, attention.scaling), k, v).after(norm)
     return Layer(qkv, affine(attention.dense), affine(layer.mlp.fc1).after(norm), affine(layer.mlp.fc2))
 
 
-def _gpt_neox(model: Any) -> Plan:
+def _gpt_neox(model: Module) -> Plan:
     config, inner = model.config, model.gpt_neox
     return Plan(
         heads=config.num_attention_heads,
@@ -301,7 +304,7 @@ def _gpt_neox(model: Any) -> Plan:
     )
 
 
-def _gpt_neox_layer(layer: Any, heads: int) -> Layer:
+def _gpt_neox_layer(layer: Module, heads: int) -> Layer:
     attention, whole = layer.attention, affine(layer.attention.query_key_value)
     # (heads x 3 x D, d): each head's query, key and value stand together -> all queries, all keys, all values.
     weight = whole.weight.view(heads, 3, -1, whole.weight.shape[1]).transpose(0, 1).flatten(0, 2)
@@ -311,7 +314,7 @@ def _gpt_neox_layer(layer: Any, heads: int) -> Layer:
     return Layer(qkv, affine(attention.dense), up, affine(layer.mlp.dense_4h_to_h))
 
 
-def _gpt2(model: Any) -> Plan | None:
+def _gpt2(model: Module) -> Plan | None:
     config, inner = model.config, model.transformer
     if config.scale_attn_by_inverse_layer_idx or config.add_cross_attention:
         return None
@@ -330,7 +333,7 @@ def _gpt2(model: Any) -> Plan | None:
     )
 
 
-def _gpt2_layer(layer: Any) -> Layer:
+def _gpt2_layer(layer: Module) -> Layer:
     qkv = _scaled_queries(affine(layer.attn.c_attn), layer.attn.scaling).after(layer.ln_1)
     return Layer(qkv, affine(layer.attn.c_proj), affine(layer.mlp.c_fc).after(layer.ln_2), affine(layer.mlp.c_proj))
 
@@ -343,7 +346,7 @@ def _scaled_queries(qkv: Affine, by: float) -> Affine:
     return Affine(qkv.weight * factor[:, None], None if qkv.bias is None else qkv.bias * factor)
 
 
-PLANS: dict[type[PreTrainedModel], Callable[[Any], Plan | None]] = {
+PLANS: dict[type[PreTrainedModel], Callable[[Module], Plan | None]] = {
     LlamaForCausalLM: _llama,
     MistralForCausalLM: _llama,
     Qwen2ForCausalLM: _llama,

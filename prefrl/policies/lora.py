@@ -10,7 +10,6 @@ import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -99,7 +98,6 @@ def merged(model: PreTrainedModel) -> PreTrainedModel:
     found = copy.deepcopy(model)  # the original goes on being fitted, with its adapters apart
     for name, module in list(found.named_modules()):
         if isinstance(module, BaseTunerLayer):
-            layer: Any = module
-            layer.merge()
-            found.set_submodule(name, layer.get_base_layer())
+            module.merge()
+            found.set_submodule(name, module.get_base_layer())
     return found
