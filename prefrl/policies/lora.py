@@ -58,16 +58,13 @@ def _turned_round(model: PreTrainedModel) -> bool:
 def without_adapters(model: torch.nn.Module) -> Iterator[None]:
     """The model as it was before it got adapters."""
     layers = [module for module in model.modules() if isinstance(module, BaseTunerLayer)]
-    trained = [p for layer in layers for p in layer.parameters() if p.requires_grad]
     for layer in layers:
         layer.enable_adapters(False)
     try:
         yield
     finally:
         for layer in layers:
-            layer.enable_adapters(True)
-        for parameter in trained:  # peft takes it away with the adapter
-            parameter.requires_grad_(True)
+            layer.enable_adapters(True)  # which makes them trainable again
 
 
 def save_adapters(model: PreTrainedModel, folder: Path) -> None:

@@ -45,6 +45,7 @@ def test_the_three_uses_stand_alone_for_control(prefrl: Shell) -> None:
     assert "5 of 5" in prefrl.out
 
 
+@pytest.mark.slow
 def test_a_reward_model_is_graded_on_what_its_fit_left_out(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL} loop.labels=40 fitting.held_out=0.3") == 0
     at_the_end = json.loads(Path("run/card.json").read_text())
@@ -98,6 +99,7 @@ def test_a_fit_says_how_little_was_held_out(prefrl: Shell) -> None:
     assert "nothing was held out" in prefrl.out
 
 
+@pytest.mark.slow
 def test_the_scores_of_texts_are_written_as_rewardbench_does(prefrl: Shell) -> None:
     assert prefrl("label text/toy loop.labels=12 --out labels") == 0
     assert prefrl("fit labels --out reward") == 0
@@ -173,6 +175,7 @@ def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_second_run_into_the_folder_of_another_is_refused(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL}") == 0
     assert "report: run/report.html" in prefrl.out

@@ -83,6 +83,7 @@ def test_a_preference_file_and_a_model_give_a_tuned_model_in_three_commands(pref
     assert "fitted on another task (task.system is  there, Hm. here)" in prefrl.err
 
 
+@pytest.mark.slow
 def test_a_policy_answers_the_prompts_of_a_file(prefrl: Shell, own_model: Path) -> None:
     write("prompts.jsonl", *({"prompt": f"p{i}"} for i in range(6)))
     settings = f"task.kind=texts task.model={own_model} task.prompts=prompts.jsonl"

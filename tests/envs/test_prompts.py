@@ -118,6 +118,7 @@ def test_a_template_gives_the_tokens_that_transformers_gives(tokenizer: PreTrain
     plain = tokenizer.apply_chat_template(TURNS[1:], add_generation_prompt=True, return_dict=False)
     assert list(opened("Hi")) == plain
     assert list(Opening(tokenizer, chat=True, system="Be brief.")("Hi")) == expected
+    assert list(Opening(tokenizer, chat=True, system="Be long.")(TRANSCRIPT)) == expected  # it has its own
     assert expected.count(tokenizer.bos_token_id) == (1 if "bos_token" in TEMPLATES[name] else 0)
 
 

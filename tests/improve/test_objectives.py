@@ -238,3 +238,14 @@ def test_the_adaptive_coefficient_moves_towards_its_target_and_no_faster_than_al
     assert start.update(6.0, 100).beta == pytest.approx(0.1)
     assert start.update(600.0, 100).beta == pytest.approx(0.1 * (1 + 0.2 * 0.1))
     assert start.update(0.0, 100).beta == pytest.approx(0.1 * (1 - 0.2 * 0.1))
+
+
+def test_what_was_not_scored_is_in_no_baseline() -> None:
+    """By hand: as if it were not there."""
+    scores = torch.tensor([[1.0, 3.0, math.nan], [math.nan, 5.0, math.nan]])
+    assert o.leave_one_out(scores).tolist() == [[-2.0, 2.0, 0.0], [0.0, 0.0, 0.0]]
+    assert o.batch_centred(scores).tolist() == [[-2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    two = o.group_normalised(torch.tensor([[1.0, 3.0]]))
+    torch.testing.assert_close(o.group_normalised(scores)[:1, :2], two)
+    torch.testing.assert_close(o.batch_scaled(scores)[0], torch.tensor([-1.0, 1.0, 0.0]) / (2 + 1e-4))
+    assert o.all_equal(scores).tolist() == [False, True]

@@ -316,6 +316,17 @@ def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Revie
     assert metrics["unscored"] == 1.0
 
 
+def test_a_policy_that_is_not_the_one_that_drew_stops_the_run(
+    toy_reviews: Reviews, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a decoder would that rounds otherwise than the forward pass, or reads old weights."""
+    one = learner(toy_reviews)
+    right = one.policy.log_prob
+    monkeypatch.setattr(one.policy, "log_prob", lambda rows: (right(rows)[0] + 0.02 * rows.mask, None))
+    with pytest.raises(FloatingPointError, match=r"update 0: .*ratio off by 0\.02"):
+        one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(0))
+
+
 def test_responses_that_did_not_end_can_be_left_out(toy_reviews: Reviews) -> None:
     """Whatever they were worth: the same is learned."""
 

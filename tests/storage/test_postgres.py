@@ -49,6 +49,7 @@ def test_readers_see_one_state_while_somebody_writes(folder: Path) -> None:
         assert connection.scalar(sql.select(sql.func.count()).select_from(event)) == before
 
 
+@pytest.mark.slow
 def test_a_store_is_opened_and_verified_while_somebody_writes(folder: Path) -> None:
     with Store[Response](folder) as store:
         fill(store)
