@@ -23,7 +23,7 @@ from transformers import (
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts, turn_end
 from prefrl.policies.cloning import make_tokenizer
-from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
+from prefrl.policies.pretrained import Precision, context_of, load_tokenizer, load_weights
 from prefrl.types import Fields, Floats, Response
 
 RESPONSE_TOKENS = 256
@@ -76,7 +76,7 @@ class TextsSettings(Settings):
     def build(self) -> Texts:
         """Raises `ConfigError` where the folder holds no model that can be used, `ValueError` for a bad file."""
         model, tokenizer = _load(self.model, self.dtype) if self.model else _small(self)
-        context = _context(model)
+        context = context_of(model)
         tokens = self.response_tokens or min(RESPONSE_TOKENS, (context or 2 * RESPONSE_TOKENS) // 2)
         opening = self._opening(tokenizer, None if context is None else context - tokens)
         learning, left_out = _known(self.prompts, opening, "prompts")
@@ -198,12 +198,6 @@ def _fits(prompt: Prompt, opening: Opening) -> bool:
         return opening.fits(prompt.text)
     except ValueError as error:
         raise ValueError(f"{prompt.place}: {error}") from None
-
-
-def _context(model: PreTrainedModel) -> int | None:
-    """The most tokens that a model has positions for; some architectures have no bound."""
-    known = getattr(model.config, "max_position_embeddings", None)
-    return None if known is None else int(known)
 
 
 def _small(settings: TextsSettings) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:

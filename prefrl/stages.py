@@ -188,19 +188,23 @@ def policy_of(folder: Path) -> LanguagePolicy:
     return learner.policy
 
 
-def generate(
-    folder: Path, prompts: Path, sampling: Drawn, seed: int = 0, batch: int = 16
-) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Each prompt of a file with the responses of a run's newest policy, `batch` prompts at a time."""
+def prompts_for(policy: LanguagePolicy, path: Path) -> list[str]:
+    """The prompts of a file. Raises `ValueError` with the row of one that leaves no room for a response."""
     from prefrl.envs.prompts import read_prompts
 
-    policy, given = policy_of(folder), read_prompts(prompts)
-    for one in given:  # all of them, before the first is answered
+    given = read_prompts(path)
+    for one in given:
         try:
             policy.opened(one.text)
         except ValueError as error:
             raise ValueError(f"{one.place}: {error}") from None
-    texts = [one.text for one in given]
+    return [one.text for one in given]
+
+
+def generate(
+    policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int = 0, batch: int = 16
+) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Each prompt with a policy's responses, `batch` prompts at a time."""
     how = replace(policy.sampling(sampling.samples, sampling.temperature), top_k=sampling.top_k, top_p=sampling.top_p)
     for start in range(0, len(texts), batch):
         some = texts[start : start + batch]

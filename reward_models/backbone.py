@@ -15,7 +15,7 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_MASKED_LM_MAPPING_N
 
 from prefrl.components import ConfigError
 from prefrl.exchange.transcripts import prompt_messages, response_messages
-from prefrl.policies.pretrained import first_line, load_tokenizer, load_weights
+from prefrl.policies.pretrained import context_of, first_line, load_tokenizer, load_weights
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
 from prefrl.seeding import to_numpy
@@ -51,7 +51,7 @@ class Backbone:
     @property
     def context(self) -> int | None:
         """The most tokens that the model has positions for."""
-        known = [getattr(self.model.config, "max_position_embeddings", None)]  # some architectures have no bound
+        known = [context_of(self.model)]
         known += _after_padding(self.model)
         if self.opened is None:
             known.append(self.tokenizer.model_max_length)

@@ -202,21 +202,19 @@ def generate(
     temperature: Annotated[float, typer.Option(help="0 takes the most probable token.", min=0)] = 1.0,
     top_k: Annotated[int, typer.Option(help="Draw among so many tokens; 0 for all.", min=0)] = 0,
     top_p: Annotated[float, typer.Option(help="Draw among tokens of this share.", min=0, max=1)] = 1.0,
-    force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Have the newest policy of a text run answer prompts; `prefrl label --given` reads what is written."""
     from prefrl import stages
     from prefrl.cli.console import counted, say
-    from prefrl.envs.prompts import read_prompts
 
-    _refuse(to.exists() and not force, f"{to} is there already: choose another name, or write over it with --force")
-    drawn = stages.generate(folder, prompts, stages.Drawn(samples, temperature, top_k, top_p))
-    total = len(read_prompts(prompts))
-    to.unlink(missing_ok=True)
-    for prompt, found in counted(drawn, total, "prompts"):
+    _refuse(to.exists(), f"{to} is there already: choose another name with --to")
+    policy = stages.policy_of(folder)
+    texts = stages.prompts_for(policy, prompts)
+    drawn = stages.generate(policy, texts, stages.Drawn(samples, temperature, top_k, top_p))
+    for prompt, found in counted(drawn, len(texts), "prompts"):
         with to.open("a", encoding="utf-8") as file:  # line by line: what was written stays, whatever comes
             file.write(json.dumps({"prompt": prompt, "responses": found}, ensure_ascii=False) + "\n")
-    say(f"{total} prompts answered in {to}")
+    say(f"{len(texts)} prompts answered in {to}")
 
 
 @app.command()

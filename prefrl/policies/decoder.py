@@ -69,15 +69,15 @@ class Plan:
     groups: int
     """Heads of keys and values."""
     eps: float
-    rms: bool
-    """Norms divide by the root mean square; else they centre as well."""
-    gated: bool
-    parallel: bool
-    """Attention and perceptron read the same input, and are added to it together."""
     act: Callable[[Tensor], Tensor]
     layers: tuple[Layer, ...]
     embedding: Tensor
     head: Affine
+    rms: bool = False
+    """Norms divide by the root mean square; else they centre as well."""
+    gated: bool = False
+    parallel: bool = False
+    """Attention and perceptron read the same input, and are added to it together."""
     places: Tensor | None = None
     """(T, d) learned positions, or None where positions turn queries and keys."""
     rotary: Module = None
@@ -238,7 +238,6 @@ def _llama(model: Module) -> Plan:
         eps=config.rms_norm_eps,
         rms=True,
         gated=True,
-        parallel=False,
         act=inner.layers[0].mlp.act_fn,
         layers=tuple(_llama_layer(layer) for layer in inner.layers),
         embedding=inner.embed_tokens.weight,
@@ -269,8 +268,6 @@ def _phi(model: Module) -> Plan | None:
         heads=config.num_attention_heads,
         groups=config.num_key_value_heads,
         eps=config.layer_norm_eps,
-        rms=False,
-        gated=False,
         parallel=True,
         act=inner.layers[0].mlp.activation_fn,
         layers=tuple(_phi_layer(layer) for layer in inner.layers),
@@ -293,8 +290,6 @@ def _gpt_neox(model: Module) -> Plan:
         heads=config.num_attention_heads,
         groups=config.num_attention_heads,
         eps=config.layer_norm_eps,
-        rms=False,
-        gated=False,
         parallel=config.use_parallel_residual,
         act=inner.layers[0].mlp.act,
         layers=tuple(_gpt_neox_layer(layer, config.num_attention_heads) for layer in inner.layers),
@@ -322,9 +317,6 @@ def _gpt2(model: Module) -> Plan | None:
         heads=config.num_attention_heads,
         groups=config.num_attention_heads,
         eps=config.layer_norm_epsilon,
-        rms=False,
-        gated=False,
-        parallel=False,
         act=inner.h[0].mlp.act,
         layers=tuple(_gpt2_layer(layer) for layer in inner.h),
         embedding=inner.wte.weight,

@@ -18,7 +18,7 @@ from transformers import GenerationConfig, PreTrainedModel, PreTrainedTokenizerB
 from prefrl.components import Settings
 from prefrl.policies.exact import check_exact, rows_of_embedding
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.pretrained import quiet
+from prefrl.policies.pretrained import context_of, quiet
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator
 from prefrl.storage.files import whole_folder
@@ -204,7 +204,7 @@ class LanguagePolicy:
             parameter.copy_(found)  # in place: the optimiser holds these very tensors
 
     def _check_room(self, tokens: int) -> None:
-        context = getattr(self.model.config, "max_position_embeddings", None)  # some architectures have no bound
+        context = context_of(self.model)
         if context is not None and tokens > context:
             raise ValueError(
                 f"a prompt and its response need up to {tokens} tokens, and the model's context has {context}: leave "

@@ -73,6 +73,12 @@ def _where(name: str | Path, download: bool) -> dict[str, Any]:
     return {"pretrained_model_name_or_path": name, **safe}
 
 
+def context_of(model: PreTrainedModel) -> int | None:
+    """The most tokens that a model has positions for; some architectures have no bound."""
+    known = getattr(model.config, "max_position_embeddings", None)
+    return None if known is None else int(known)
+
+
 def first_line(error: Exception) -> str:
     """What went wrong; the advice that libraries add is for others."""
     return str(error).strip().partition("\n")[0]

@@ -89,7 +89,8 @@ def test_a_policy_answers_the_prompts_of_a_file(prefrl: Shell, own_model: Path) 
     settings = f"task.kind=texts task.model={own_model} task.prompts=prompts.jsonl"
     assert prefrl(f"run text/sentiment {settings} {SMALL} --out run") == 0
     for extra in ("", "--top-k 3 --top-p 0.9", "--temperature 0"):
-        assert prefrl(f"generate run --prompts prompts.jsonl --samples 3 {extra} --force") == 0
+        Path("responses.jsonl").unlink(missing_ok=True)
+        assert prefrl(f"generate run --prompts prompts.jsonl --samples 3 {extra}") == 0
         found = [json.loads(line) for line in Path("responses.jsonl").read_text().strip().split("\n")]
         assert [row["prompt"] for row in found] == [f"p{i}" for i in range(6)]
         assert all(len(row["responses"]) == 3 for row in found)
