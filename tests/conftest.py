@@ -54,7 +54,10 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def _warm(request: pytest.FixtureRequest, _own_cache: None) -> None:
     """Where tests are held to a budget: what they all need is there, so that none pays for it by being the first."""
     if request.config.getoption("--budget"):
-        for name in ("torch.utils.tensorboard", "transformers.models.gpt2.modeling_gpt2", "matplotlib.pyplot"):
+        for name in (
+            "torch.utils.tensorboard", "transformers.models.gpt2.modeling_gpt2", "matplotlib.pyplot",
+            "stable_baselines3", "gymnasium.envs.mujoco",
+        ):  # fmt: skip
             import_module(name)
         request.getfixturevalue("finished_tiny")
 
@@ -155,17 +158,6 @@ def finished_tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         config = runs.tiny(name)
         made[name] = runs.made_once(tmp_path_factory, f"tiny-{number}", partial(runs.finish, config))
     return made
-
-
-@pytest.fixture(scope="session")
-def reviews_policy(tmp_path_factory: pytest.TempPathFactory, _own_cache: None) -> None:
-    """The starting policy of "text/reviews" has been made, which takes minutes, once for all tests."""
-
-    def make(folder: Path) -> None:
-        Config.load("text/reviews").build_task()
-        folder.mkdir()
-
-    runs.made_once(tmp_path_factory, "reviews-policy", make)
 
 
 @pytest.fixture(scope="session")

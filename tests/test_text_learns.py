@@ -9,7 +9,6 @@ from prefrl.store import Store
 from prefrl.types import Response
 
 
-@pytest.mark.usefixtures("reviews_policy")
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.nightly)])
 def test_reviews_become_positive_and_stay_fluent_from_few_labels(tmp_path: Path, seed: int) -> None:
     with Store[Response](tmp_path / "store") as store:

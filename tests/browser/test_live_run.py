@@ -18,7 +18,7 @@ LABELS = 90
 
 
 @pytest.fixture
-def running(tmp_path: Path, reviews_policy: None) -> Any:
+def running(tmp_path: Path) -> Any:
     """The command that a person would type, for fewer labels."""
     settings = ["labeler.kind=web", f"labeler.port={free_port()}", "labeler.enough=0.9", "labeler.strength=false"]
     size = ["loop.rounds=2", f"loop.labels={LABELS}", "learner.evaluation_prompts=128"]

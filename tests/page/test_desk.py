@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 
+import pytest
 from web_service import Clock
 
 from prefrl.page.desk import APART, Desk
@@ -244,6 +245,7 @@ def test_progress_counts_what_one_could_still_be_given() -> None:
     assert made.progress("ann") == (1, 4, 4, 0)
 
 
+@pytest.mark.slow
 def test_the_next_question_is_found_at_once_among_a_hundred_thousand() -> None:
     made = desk(asked(100_000), "ann", "ben", overlap=3)
     skipped = made.pick("ann", 20_000)[1]
