@@ -20,6 +20,7 @@ from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Noted, RewardModel, Task
+from prefrl.ranks import build, lead, rounds
 from prefrl.report.examples import save_examples
 from prefrl.report.report import write_report
 from prefrl.seeding import streams
@@ -54,7 +55,7 @@ class Run:
         self.store: Store = Store(self.folder)
         try:
             _claim(config, self.folder, self.store)
-            self.loop: Loop = config.build(self.store)
+            self.loop: Loop = build(config, self.store)
             if isinstance(self.loop.task, Noted):
                 self.notes += self.loop.task.notes
             self._start_from(reward)
@@ -63,6 +64,7 @@ class Run:
             self._events = _events(self.folder, self.loop.round)
             if isinstance(self.loop.labeler, Attended):
                 self.notes += self.loop.labeler.open(self.store)
+            lead(config, self.loop)
         except BaseException:  # Ctrl-C too: a folder must not stay owned by a start that failed
             self.store.close()
             raise
@@ -87,7 +89,7 @@ class Run:
         self.store.close()
 
     def __iter__(self) -> Iterator[Round]:
-        for round in self.loop.run():
+        for round in rounds(self.loop):
             self._record(round)
             yield round
 

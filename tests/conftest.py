@@ -161,14 +161,15 @@ def finished_tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
-def toy_reviews(tmp_path_factory: pytest.TempPathFactory) -> Reviews:
-    """The text task with a tiny starting policy, cloned once for all tests."""
-    from prefrl.envs.text import ReviewsSettings
-    from prefrl.policies.cloning import CloningSettings
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where tiny starting policies are kept, once for all tests."""
+    return runs.made_once(tmp_path_factory, "models", Path.mkdir)
 
-    cache = runs.made_once(tmp_path_factory, "models", Path.mkdir)
-    cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
-    return ReviewsSettings(response_tokens=24, cloning=cloning).build()
+
+@pytest.fixture(scope="session")
+def toy_reviews(models: Path) -> Reviews:
+    """The text task with a tiny starting policy, cloned once for all tests."""
+    return runs.small_reviews(models)
 
 
 @pytest.fixture

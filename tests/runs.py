@@ -8,12 +8,16 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from filelock import FileLock
 
 from prefrl.config import Config
 from prefrl.rundir import Run
+
+if TYPE_CHECKING:
+    from prefrl.envs.text import Reviews
 
 SHARED = "PREFRL_TESTS_SHARED"
 TINY = {
@@ -57,6 +61,15 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def copied(run: Path, folder: Path) -> Path:
     shutil.copytree(run, folder)
     return folder
+
+
+def small_reviews(cache: Path) -> Reviews:
+    """The text task with a tiny starting policy, which is kept in that folder once it was cloned."""
+    from prefrl.envs.text import ReviewsSettings
+    from prefrl.policies.cloning import CloningSettings
+
+    cloning = CloningSettings(layers=1, width=32, heads=2, vocabulary=1000, reviews=2400, batch_size=16, cache=cache)
+    return ReviewsSettings(response_tokens=24, cloning=cloning).build()
 
 
 def exit_code(program: str, *arguments: str) -> int:

@@ -14,6 +14,7 @@ import typer
 
 from prefrl.cli.exchange import Labelers, Out, Split
 from prefrl.cli.exchange import commands as exchange_commands
+from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
@@ -48,6 +49,7 @@ def run(
     dry_run: Annotated[
         bool, typer.Option(help="Build everything, run a small round, estimate time, write nothing.")
     ] = False,
+    ranks: Ranks = 1,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
     from prefrl.cli.console import drive, say
@@ -57,19 +59,23 @@ def run(
     if dry_run:
         _dry_run(config)
         return
-    if out is None:
-        out = _new_folder(source)
-        say(f"the run's folder: {out}")
-    drive(Run(config, out))
+    with on(ranks) as here:
+        if here and out is None:
+            out = _new_folder(source)
+            say(f"the run's folder: {out}")
+        if here and out is not None:
+            drive(Run(config, out))
 
 
 @app.command()
-def resume(folder: Folder) -> None:
+def resume(folder: Folder, ranks: Ranks = 1) -> None:
     """Go on with a run that was stopped."""
     from prefrl.cli.console import drive
     from prefrl.rundir import Run
 
-    drive(Run.resume(folder))
+    with on(ranks) as here:
+        if here:
+            drive(Run.resume(folder))
 
 
 @app.command()
@@ -151,13 +157,16 @@ def improve(
     overrides: Overrides = None,
     reward: Annotated[Path, typer.Option(help="A run, or what `prefrl fit` wrote.", exists=True)] = Path("reward"),
     out: Out = Path("policy"),
+    ranks: Ranks = 1,
 ) -> None:
     """Improve a policy against a saved reward model."""
     from prefrl import stages
     from prefrl.cli.console import drive
     from prefrl.rundir import Run
 
-    drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
+    with on(ranks) as here:
+        if here:
+            drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
 
 
 @app.command()

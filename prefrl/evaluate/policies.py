@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from prefrl.distributed import world
 from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import segment
@@ -51,7 +53,7 @@ def responses(
     task = policy.task
     drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, policy.sampling(1, temperature=1.0))
     found = policy.with_gold(drawn)
-    gold, scores = np.array([r.gold for r in found], float), reward.score(found)
+    gold, scores = np.array([r.gold for r in found], float), scored(reward, found)
     metrics = {
         "gold": float(gold.mean()),
         "gold_std": float(gold.std()),
@@ -67,6 +69,13 @@ def responses(
     fluent = task.fluency(found)
     metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
     return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count
+
+
+def scored(reward: RewardModel[Response], candidates: Sequence[Response]) -> Floats:
+    """(N,) `reward.score`; ranks share the candidates."""
+    mine = torch.from_numpy(reward.score(candidates[world().mine]))
+    found: Floats = world().whole(mine, len(candidates)).numpy()
+    return found
 
 
 def _mean(scores: Floats) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from prefrl.distributed import world
 from prefrl.fit import semi
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
 from prefrl.fit.losses import weighted_mean
@@ -66,7 +67,7 @@ class Problem(Generic[C]):
         # Centring and pseudo-labels look at every member's score of every candidate.
         if not (fitting.centre or len(extra) or counts.all()):
             stacked = {**stacked, "used": _used(here_terms, counts, len(needed))}
-        scores = self.reward.scores(stacked)
+        scores = shared_scores(self.reward, stacked)
         loss = weighted_mean(self.likelihood.losses(here_terms, scores), counts)
         if fitting.reliability == "learned":
             # The loss is a mean over judgements: over all their weights, the prior keeps its size beside it.
@@ -157,7 +158,10 @@ class _Descent(Generic[C]):
     def _step(self, loss: Tensor) -> None:
         for parameter in self._all():
             parameter.grad = None
-        loss.backward()  # type: ignore[no-untyped-call]
+        if loss.requires_grad:  # a rank that scored nothing may have nothing to learn
+            loss.backward()  # type: ignore[no-untyped-call]
+        # What is learned beside the reward sees all scores on every rank: its gradient is whole already.
+        world().sum_gradients(self.parameters)
         # The reward's alone: a tie or an error rate has few gradients, on another scale.
         norm = _shorten([p.grad for p in self.parameters if p.grad is not None], self.fitting.max_grad_norm)
         if not math.isfinite(norm):  # before the step, which would spread it over all weights
@@ -237,8 +241,22 @@ def _minimise(loss: Callable[[], Tensor], parameters: list[Tensor]) -> None:
 def all_scores(reward: RewardModel[C], stacked: Mapping[str, Tensor], chunk: int = 256) -> Tensor:
     """(E, N) raw scores of everything stacked, a chunk at a time."""
     count = len(next(iter(stacked.values())))
-    parts = [reward.scores({k: x[i : i + chunk] for k, x in stacked.items()}) for i in range(0, count, chunk)]
+    parts = [shared_scores(reward, {k: x[i : i + chunk] for k, x in stacked.items()}) for i in range(0, count, chunk)]
     return torch.cat(parts, 1)
+
+
+def shared_scores(reward: RewardModel[C], stacked: Mapping[str, Tensor]) -> Tensor:
+    """(E, N) `reward.scores`; ranks share the candidates, and each has gradients of its own ones."""
+    mine, count = world().mine, len(next(iter(stacked.values())))
+    if world().size == 1:
+        return reward.scores(stacked)
+    own = {name: x[mine] for name, x in stacked.items()}
+    some = next(iter(own.values()))
+    scores = reward.scores(own) if len(some) else torch.zeros(reward.members, 0, device=some.device)
+    found = world().whole(scores.detach().T.contiguous(), count).T
+    # Every rank works out the same loss of all scores; what it says of a candidate goes back where that was scored.
+    found[:, mine] = scores
+    return found
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from prefrl.components import Settings
 from prefrl.fit.pairs import Batch, batch
-from prefrl.improve.gradient import Parts, descend
+from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import dpo_loss
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguageSettings, Responses
@@ -100,7 +100,7 @@ class DPO:
 
     def _parts(self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers) -> Parts:
         """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
-        for some in np.array_split(at, -(-2 * len(at) // self._settings.policy.chunk)):
+        for some in in_parts(at, self._settings.policy.chunk // 2):
             # Shares of the whole minibatch: the parts add up to its mean. The two of a pair stand side by side: (2 m,).
             arrays = (data.weight[some] / data.weight[at].sum(), data.edges[some].flatten(), data.preference[some])
             share, pairs, preference = (torch.from_numpy(x).to(reference.device) for x in arrays)

@@ -15,6 +15,7 @@ from typing import Generic, TypeAlias
 import torch
 from torch import Tensor
 
+from prefrl.distributed import world
 from prefrl.improve.objectives import (
     Reduction,
     clipped_surrogate,
@@ -26,7 +27,7 @@ from prefrl.improve.objectives import (
     value_loss,
 )
 from prefrl.protocols import I, Policy
-from prefrl.types import Metrics
+from prefrl.types import Integers, Metrics
 
 Parts: TypeAlias = Iterable[tuple[Tensor, dict[str, Tensor]]]
 """A loss in parts that add up, each with what it measured: (loss, name -> number)."""
@@ -78,14 +79,16 @@ class Batch(Generic[I]):
         return Batch(inputs, logp, advantages, cut(self.returns))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
-        """Parts of at most `size` sequences of like length, so that little padding is computed on; all at once for
-        None."""
-        if size is None:
+        """This rank's sequences, at most `size` of like length at a time, so that little padding is computed on; all
+        at once for None."""
+        if size is None and world().size == 1:
             yield self
             return
         # Stable: rows of equal length keep their order, so that the same seed rounds in the same way.
-        for at in self.inputs.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
-            yield self.rows(at)
+        mine = self.inputs.lengths().argsort(stable=True)[world().mine]
+        if len(mine):  # there may be fewer sequences than ranks
+            for at in mine.split(size or len(mine)):  # type: ignore[no-untyped-call]
+                yield self.rows(at)
 
 
 def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torch.optim.Adam:
@@ -131,23 +134,22 @@ def descend(
     parts: Parts,
     max_grad_norm: float,
 ) -> Metrics:
-    """One gradient step on a loss that comes in parts.
+    """One gradient step on a loss that comes in parts, of all ranks together.
 
     Losses and measures add up over parts; `ratio_error` is the largest. Raises FloatingPointError, before anything
     changes, where the loss or the gradient is not finite.
     """
     optimizer.zero_grad()
-    measured = []
+    parameters, measured = list(parameters), []
+    names: tuple[str, ...] = ()
     for loss, seen in parts:
         # One part's graph at a time is in memory; gradients add up in the parameters.
         loss.backward()  # type: ignore[no-untyped-call]
         names = ("loss", *seen)
         # Detached, or the list would keep every part's graph alive.
         measured.append(torch.stack([loss.detach(), *seen.values()]))
-    found = torch.stack(measured)
-    metrics = dict(zip(names, found.sum(0).tolist(), strict=True))
-    if "ratio_error" in metrics:
-        metrics["ratio_error"] = float(found[:, names.index("ratio_error")].max())
+    world().sum_gradients(parameters)
+    metrics = _added(names, torch.stack(measured).tolist() if measured else [])
     metrics["grad_norm"] = float(torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm))
     for name in ("loss", "grad_norm"):
         if not math.isfinite(metrics[name]):
@@ -157,6 +159,21 @@ def descend(
             )
     optimizer.step()
     return metrics
+
+
+def in_parts(at: Integers, size: int) -> Iterator[Integers]:
+    """This rank's share of some rows, at most so many at a time."""
+    mine = at[world().mine]
+    for start in range(0, len(mine), size):
+        yield mine[start : start + size]
+
+
+def _added(names: tuple[str, ...], parts: list[list[float]]) -> Metrics:
+    """The measures of a gradient step, from those of the parts on each rank; one without rows knows no names."""
+    everywhere = world().gathered((names, parts))
+    names = next(names for names, _ in everywhere if names)
+    columns = zip(*(part for _, parts in everywhere for part in parts), strict=True)
+    return {name: (max if name == "ratio_error" else sum)(column) for name, column in zip(names, columns, strict=True)}
 
 
 def _losses(

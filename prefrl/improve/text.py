@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings, filled_in
+from prefrl.evaluate.policies import scored
 from prefrl.improve.gradient import Batch, Objective, update
 from prefrl.improve.objectives import (
     AdaptiveKL,
@@ -200,9 +201,9 @@ class TextLearner:
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
         settings = self._settings
-        found = reward.score(drawn.candidates(self._task.tokenizer))  # (B,)
+        found = scored(reward, drawn.candidates(self._task.tokenizer))  # (B,)
         raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
-        scored = ~raw.isnan()
+        known = ~raw.isnan()
         scores = self._finite("reward", self._shaped(raw, drawn))  # NaN: what was not scored teaches nothing
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
@@ -223,7 +224,7 @@ class TextLearner:
         return steps[-1] | {
             "ratio_error": steps[0]["ratio_error"],
             "reward": float(raw.nanmean()),
-            "reward_std": float(raw[scored].std(correction=0)) if scored.any() else math.nan,
+            "reward_std": float(raw[known].std(correction=0)) if known.any() else math.nan,
             "unscored": float(scores.isnan().float().mean()),
             **(self._distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
             "surprise": -float(masked_mean(drawn.logp, drawn.mask)),

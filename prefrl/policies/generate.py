@@ -7,13 +7,14 @@ have ended leave the batch. What comes back was drawn from the raw policy: no ge
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
 from torch import Tensor
 from transformers import DynamicCache, PreTrainedModel
 
+from prefrl.distributed import world
 from prefrl.policies.decoder import FastDecoder, plan
 
 KEEP_SHARE = 0.75
@@ -104,8 +105,19 @@ def generate(
     """
     if model.training:
         raise ValueError("generation wants the model in eval mode: dropout would falsify its log-probabilities")
-    decoder, logits = _prefill(model, prompts, sampling, fast)
-    return _decode(decoder, logits, sampling, generator)
+    count, shape = len(prompts), (len(prompts), sampling.samples, sampling.max_tokens)
+    # All randomness is drawn first, a number for each place: what a row gets hangs neither on when others end, nor on
+    # which rank it is on.
+    uniform = torch.rand(shape, generator=generator)[world().mine].flatten(0, 1).to(model.device)
+    if mine := prompts[world().mine]:
+        decoder, logits = _prefill(model, mine, sampling, fast)
+        drawn = _decode(decoder, logits, sampling, uniform)
+    else:
+        drawn = _nothing(uniform)
+    if world().size == 1:
+        return drawn
+    found = [getattr(drawn, one.name).unflatten(0, (-1, sampling.samples)) for one in fields(Generation)]
+    return Generation(*(world().whole(x, count).flatten(0, 1) for x in found))
 
 
 def pad_left(prompts: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
@@ -143,15 +155,18 @@ def _prefill(
     return CacheDecoder(model, cache, mask, sampling.samples), logits
 
 
-def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, generator: torch.Generator) -> Generation:
-    rows, length = len(logits), sampling.max_tokens
-    # All randomness is drawn first, a number for each place: what a row gets does not hang on when others end.
-    uniform = torch.rand(rows, length, generator=generator).to(logits.device)
+def _nothing(uniform: Tensor) -> Generation:
+    """Padding for (B, L) places."""
+    logp = torch.zeros_like(uniform)
+    return Generation(logp.long(), logp.bool(), logp, logp[:, 0].bool())
+
+
+def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, uniform: Tensor) -> Generation:
+    """(B, V) logits of the first tokens, and a number in [0, 1) for each of the (B, L) places."""
+    rows, length = uniform.shape
+    drawn_so_far = _nothing(uniform)
+    tokens, mask, logp, ended = (getattr(drawn_so_far, one.name) for one in fields(Generation))
     ends = torch.tensor(sampling.ends, dtype=torch.int64, device=logits.device)
-    tokens = torch.zeros(rows, length, dtype=torch.int64, device=logits.device)
-    mask = torch.zeros(rows, length, dtype=torch.bool, device=logits.device)
-    logp = torch.zeros(rows, length, device=logits.device)
-    ended = torch.zeros(rows, dtype=torch.bool, device=logits.device)
     live = torch.arange(rows, device=logits.device)
     for t in range(length):
         drawn, drawn_logp = draw(_narrowed(logits, sampling), uniform[live, t], sampling.temperature or 1.0)

@@ -16,6 +16,7 @@ from torch import Tensor
 from transformers import GenerationConfig, PreTrainedModel, PreTrainedTokenizerBase
 
 from prefrl.components import Settings
+from prefrl.distributed import world
 from prefrl.policies.exact import check_exact, rows_of_embedding
 from prefrl.policies.generate import Sampling, generate
 from prefrl.policies.pretrained import context_of, quiet
@@ -256,12 +257,14 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
 def all_logp(
     model: PreTrainedModel, responses: Responses, temperature: float, part: int, head_alone: bool = True
 ) -> Tensor:
-    """`response_logp` without gradients, a part of the rows at a time."""
-    found = torch.zeros(responses.mask.shape, device=responses.mask.device)
-    for at, rows in responses.parts(part):
-        # a part is cut to its longest row
-        found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, head_alone)
-    return found
+    """`response_logp` without gradients, a part of the rows at a time; ranks share the rows."""
+    found = torch.zeros(responses.mask.shape, device=responses.mask.device)[world().mine]
+    if len(found):
+        mine = responses if world().size == 1 else responses.rows(torch.arange(len(responses))[world().mine])
+        for at, rows in mine.parts(part):
+            # a part is cut to its longest row
+            found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, head_alone)
+    return world().whole(found, len(responses))
 
 
 def head_logits(model: PreTrainedModel, hidden: Tensor) -> Tensor:

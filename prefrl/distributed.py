@@ -1,0 +1,167 @@
+"""Several processes on one computation: who is who, and what they share.
+
+Every rank holds the same batch, the same parameters and the same generators; only what is dear is shared out, by rows
+(a prompt to answer, a response to score or to learn from): each rank computes its own, and all get the whole. So
+counts, baselines, minibatches and metrics are of the whole batch wherever they are computed, and no result hangs on the
+number of ranks but by rounding. A process by itself is a world of one, where all of this does nothing.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+T = TypeVar("T")
+
+PATIENCE = timedelta(days=365)
+"""People may take days to answer; a rank that dies is noticed at once, by its closed connections."""
+
+
+class LostRanksError(ConnectionError):
+    """Another rank has ended while this one went on."""
+
+
+@dataclass(frozen=True)
+class World:
+    """The processes that compute together, and which of them this is."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def mine(self) -> slice:
+        """This rank's rows. Every size-th one: of rows in order of length each rank gets short and long ones."""
+        return slice(self.rank, None, self.size)
+
+    def whole(self, mine: Tensor, count: int) -> Tensor:
+        """All `count` rows, from the rows (c, ...) that each rank computed of its own."""
+        if self.size == 1:
+            return mine
+        most = -(-count // self.size)
+        padded = mine.new_zeros(most, *mine.shape[1:])
+        padded[: len(mine)] = mine
+        found = [torch.empty_like(padded) for _ in range(self.size)]
+        with _heard():
+            dist.all_gather(found, padded)
+        return torch.stack(found, 1).flatten(0, 1)[:count]  # (most, size, ...): row by row, and rank by rank in each
+
+    def gathered(self, mine: T) -> list[T]:
+        """What each rank has, in their order."""
+        if self.size == 1:
+            return [mine]
+        found: list[Any] = [None] * self.size
+        with _heard():
+            dist.all_gather_object(found, mine)
+        return found
+
+    def sum_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
+        """Give every rank the sum of all ranks' gradients, to the same bits; a missing one counts as 0."""
+        if self.size == 1:
+            return
+        learning = [p for p in parameters if p.requires_grad]
+        flat = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in learning])
+        with _heard():
+            dist.all_reduce(flat)
+        for parameter, total in zip(learning, flat.split([p.numel() for p in learning]), strict=True):  # type: ignore[no-untyped-call]
+            parameter.grad = total.view_as(parameter)
+
+    def first(self, call: Callable[[], T]) -> T:
+        """What `call` returns on rank 0, on all ranks; what it raises there, all raise. The others do not call it."""
+        if self.size == 1:
+            return call()
+        told: list[Any] = [None]
+        if self.rank == 0:
+            with alone():  # nobody would answer
+                told = [_outcome(call)]
+        with _heard():
+            dist.broadcast_object_list(told)
+        found, error = told[0]
+        if error is not None:
+            raise error
+        result: T = found
+        return result
+
+
+_joined = World()
+"""All processes of this computation."""
+_now = World()
+"""Those that compute together at this moment."""
+
+
+def world() -> World:
+    """The processes that compute together now: this one alone, unless `together` says otherwise."""
+    return _now
+
+
+def joined() -> World:
+    """All processes of this computation, whether or not they compute together now."""
+    return _joined
+
+
+@contextmanager
+def together() -> Iterator[World]:
+    """Meanwhile all ranks do the same, and share what is dear: every one of them has to come here."""
+    with _among(_joined) as one:
+        yield one
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Meanwhile this rank does what the others do not."""
+    with _among(World()):
+        yield
+
+
+def join(rank: int, size: int, meeting: str = "env://") -> None:
+    """Meet the other ranks: at an address of torch's `init_method`. On GPUs each rank takes one of its machine's."""
+    global _joined
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", rank)) % torch.cuda.device_count())
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+    dist.init_process_group(backend, init_method=meeting, rank=rank, world_size=size, timeout=PATIENCE)
+    _joined = World(rank, size)
+
+
+def leave() -> None:
+    """Part from the other ranks."""
+    global _joined
+    if _joined.size > 1:
+        dist.destroy_process_group()
+    _joined = World()
+
+
+@contextmanager
+def _among(those: World) -> Iterator[World]:
+    global _now
+    before, _now = _now, those
+    try:
+        yield those
+    finally:
+        _now = before
+
+
+@contextmanager
+def _heard() -> Iterator[None]:
+    """What goes wrong here is that others do not answer."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise LostRanksError(
+            f"rank {_joined.rank} of {_joined.size} hears no more of another one, which has ended; what was finished "
+            "is kept: start again, and the run goes on from there"
+        ) from error
+
+
+def _outcome(call: Callable[[], T]) -> tuple[T | None, Exception | None]:
+    try:
+        return call(), None
+    except Exception as error:
+        return None, error

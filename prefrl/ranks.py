@@ -1,0 +1,184 @@
+"""One run on several ranks: rank 0 has the folder, the store, the labeler and the selector; all the others follow.
+
+Every rank goes through the same `Loop`. What belongs to rank 0 is asked there, and all are told what it answered; what
+samples, fits, improves and evaluates shares its rows (`prefrl.distributed`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic
+
+import numpy as np
+import torch
+
+from prefrl.components import ConfigError
+from prefrl.config import Config
+from prefrl.distributed import joined, together, world
+from prefrl.judgements import Answer, Judged
+from prefrl.kinds import RESPONSES
+from prefrl.loop import Loop
+from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store
+from prefrl.seeding import to_numpy
+from prefrl.types import C, Floats, Json, Query, Round
+
+
+class RanksError(RuntimeError):
+    """Ranks that should have the same parameters do not."""
+
+
+@dataclass(frozen=True)
+class SharedStore(Generic[C]):
+    """A `Store` that rank 0 alone has."""
+
+    kept: Store[C] | None
+    """None on the others."""
+
+    @property
+    def own(self) -> Store[C]:
+        assert self.kept is not None  # nobody else comes here
+        return self.kept
+
+    @property
+    def sequence(self) -> int:
+        return world().first(lambda: int(self.own.sequence))
+
+    def judged(self, upto: int | None = None) -> list[Judged[C]]:
+        return world().first(lambda: list(self.own.judged(upto)))
+
+    def open_queries(self, labeler: str = "") -> list[Query[C]]:
+        return world().first(lambda: list(self.own.open_queries(labeler)))
+
+    def gold(self, candidates: Sequence[C]) -> list[Floats]:
+        return world().first(lambda: list(self.own.gold(candidates)))
+
+    def ask(self, queries: Sequence[Query[C]]) -> None:
+        world().first(lambda: self.own.ask(queries))
+
+    def answer(self, answers: Sequence[Answer]) -> None:
+        world().first(lambda: self.own.answer(answers))
+
+    def retract(self, query: str, labeler: str) -> None:
+        world().first(lambda: self.own.retract(query, labeler))
+
+    def counts(self) -> dict[str, int]:
+        return world().first(lambda: dict(self.own.counts()))
+
+    def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
+        return world().first(lambda: set(self.own.asked_before(ids, sequence)))
+
+
+@dataclass(frozen=True)
+class SharedLabeler(Generic[C]):
+    """A `Labeler` whom rank 0 alone asks, and for whom it alone has anything open."""
+
+    own: Labeler[C]
+
+    @property
+    def name(self) -> str:
+        return self.own.name
+
+    def answer(self, store: Store[C], rng: np.random.Generator) -> None:
+        assert isinstance(store, SharedStore)
+        world().first(lambda: self.own.answer(store.own, rng))
+
+    def open(self, store: Store[C], fixed: bool = False) -> list[str]:
+        return self.own.open(store, fixed) if isinstance(self.own, Attended) else []
+
+    def close(self) -> None:
+        if isinstance(self.own, Attended):
+            self.own.close()
+
+
+@dataclass(frozen=True)
+class SharedSelector(Generic[C]):
+    """A `Selector` that rank 0 alone asks."""
+
+    own: Selector[C]
+
+    def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
+        return world().first(lambda: self.own.select(pool, reward, count, rng))
+
+
+def build(config: Config, store: Store[C] | None) -> Loop[C]:
+    """A run's loop: as `config.build`, and where there are several ranks, one that they go through together.
+
+    Raises `ConfigError` for several ranks where the kind of task is not shared out.
+    """
+    loop: Loop[C] = config.build(store)  # type: ignore[arg-type]  # the loop of another rank never looks at it
+    if joined().size == 1:
+        return loop
+    if loop.task.kind != RESPONSES.name:
+        raise ConfigError(f"{joined().size} ranks share the work on text alone, and the task is of {loop.task.kind}")
+    return replace(
+        loop,
+        store=SharedStore(store),
+        labeler=SharedLabeler(loop.labeler),
+        selector=SharedSelector(loop.selector),
+    )
+
+
+def lead(config: Config, loop: Loop[C]) -> None:
+    """Tell the ranks that `follow` what to run, and from where."""
+    with together() as ranks:
+        ranks.first(lambda: config.model_dump(mode="json"))
+        _align(loop)
+
+
+def follow() -> None:
+    """Go through rank 0's run with it, to its end."""
+    with together() as ranks:
+        told: Json = ranks.first(dict)
+    loop = build(Config.model_validate(told), None)
+    with together():
+        _align(loop)
+    for _ in rounds(loop):
+        pass
+
+
+def rounds(loop: Loop[C]) -> Iterator[Round[C]]:
+    """`loop.run()`, each round on all ranks together; alone again in between. Raises `RanksError` where they part."""
+    found = loop.run()
+    while True:
+        with together() as ranks:
+            if (round := next(found, None)) is None:
+                return
+            if len(set(ranks.gathered(_digest(loop.learner, loop.reward) if ranks.size > 1 else ""))) > 1:
+                raise RanksError(
+                    f"after round {round.number} the ranks have other parameters than each other: use one kind of "
+                    "machine and one version of torch on all of them"
+                )
+        yield round
+
+
+def _align(loop: Loop[C]) -> None:
+    """Stand where rank 0 stands."""
+    round, sequence, learner, reward = world().first(
+        lambda: (loop.round, loop.sequence, loop.learner.state(), loop.reward.state())
+    )
+    if world().rank:
+        loop.round, loop.sequence = round, sequence
+        loop.learner.load(learner)
+        loop.reward.load(reward)
+
+
+def _digest(*parts: Learner[C] | RewardModel[C]) -> str:
+    """Of everything that was learned."""
+    found = hashlib.sha256()
+    for part in parts:
+        for tensor in _tensors(part.state()):
+            found.update(to_numpy(tensor.contiguous().flatten().view(torch.uint8)).tobytes())
+    return found.hexdigest()
+
+
+def _tensors(state: Any) -> Iterator[torch.Tensor]:
+    if isinstance(state, dict):
+        for key in state:
+            yield from _tensors(state[key])
+    elif isinstance(state, list | tuple):
+        for value in state:
+            yield from _tensors(value)
+    elif isinstance(state, torch.Tensor):
+        yield state

@@ -1,0 +1,135 @@
+"""A run on several processes, as it is started from a shell: what it comes to, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from runs import TINY, finish, tiny
+
+from prefrl.store import Store
+
+TORCHRUN = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
+ROUNDS = "loop.rounds=8"
+SETTINGS = ("text/toy", *TINY["text/toy"], ROUNDS)
+slow = pytest.mark.slow
+WITHIN = 10.0
+"""Seconds in which all ranks end once one has."""
+
+
+def started(*arguments: str, by: tuple[str, ...] = ("-m",), log: Path | None = None) -> subprocess.Popen[bytes]:
+    with (log or Path(os.devnull)).open("wb") as out:
+        return subprocess.Popen([sys.executable, *by, "prefrl", *arguments], stdout=out, stderr=subprocess.STDOUT)
+
+
+def rows(folder: Path) -> list[dict[str, float]]:
+    path = folder / "metrics.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def weights(folder: Path) -> bytes:
+    """Of the newest checkpoint."""
+    newest = max((folder / "checkpoints").iterdir())
+    return b"".join((newest / f"{part}.safetensors").read_bytes() for part in ("learner", "reward"))
+
+
+@pytest.fixture(scope="module")
+def on_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("two") / "run"
+    assert started("run", *SETTINGS, "--ranks", "2", "--out", str(folder)).wait() == 0
+    return folder
+
+
+@slow
+def test_two_ranks_ask_and_count_what_one_does(on_two: Path, tmp_path: Path) -> None:
+    finish(tiny("text/toy", ROUNDS), alone := tmp_path / "one")
+    with Store[Any](alone, write=False) as a, Store[Any](on_two, write=False) as b:
+        assert [one.query.id for one in a.judged()] == [one.query.id for one in b.judged()] != []
+    for one, two in zip(rows(alone), rows(on_two), strict=True):
+        counted = [name for name in one if name.startswith(("steps/", "label/"))]
+        assert len(counted) >= 5
+        assert {name: one[name] for name in counted} == {name: two[name] for name in counted}
+        assert two["evaluate/kl"] == pytest.approx(one["evaluate/kl"], abs=1e-4)
+
+
+@pytest.mark.nightly
+def test_torchrun_starts_the_same(on_two: Path, tmp_path: Path) -> None:
+    assert started("run", *SETTINGS, "--out", str(tmp_path / "run"), by=TORCHRUN).wait() == 0
+    assert weights(tmp_path / "run") == weights(on_two)
+
+
+@slow
+@pytest.mark.parametrize("killed", ["first", "other"])
+def test_where_one_rank_is_killed_all_end_and_the_run_goes_on_to_the_same_bytes(
+    killed: str, on_two: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    first = started("run", *SETTINGS, "--ranks", "2", "--out", str(folder))
+    while not rows(folder):
+        assert first.poll() is None
+        time.sleep(0.02)
+    (other,) = children(first.pid)
+    os.kill(first.pid if killed == "first" else other, signal.SIGKILL)
+    begin = time.monotonic()
+    assert first.wait(WITHIN) != 0
+    while alive(other):
+        assert time.monotonic() - begin < WITHIN
+        time.sleep(0.02)
+    assert len(rows(folder)) < len(rows(on_two))
+    assert started("resume", str(folder), "--ranks", "2").wait() == 0
+    assert weights(folder) == weights(on_two)
+
+
+@slow
+def test_ctrl_c_stops_all_ranks_and_says_how_to_go_on(tmp_path: Path, heard: None) -> None:
+    folder, log = tmp_path / "run", tmp_path / "log"
+    first = started("run", *SETTINGS, "--ranks", "2", "--out", str(folder), log=log)
+    while not rows(folder):
+        assert first.poll() is None
+        time.sleep(0.02)
+    (other,) = children(first.pid)
+    first.send_signal(signal.SIGINT)
+    assert first.wait(WITHIN) == 130
+    assert f"prefrl resume {folder}" in log.read_text()
+    assert "Traceback" not in log.read_text()
+    begin = time.monotonic()
+    while alive(other):
+        assert time.monotonic() - begin < WITHIN
+        time.sleep(0.02)
+
+
+@slow
+def test_control_is_refused_in_one_line(tmp_path: Path) -> None:
+    refused = started("run", "control/toy", "--ranks", "2", "--out", str(tmp_path / "run"), log=tmp_path / "log")
+    assert refused.wait() == 2
+    (line,) = (tmp_path / "log").read_text().splitlines()
+    assert line == "error: 2 ranks share the work on text alone, and the task is of control"
+
+
+def children(pid: int) -> list[int]:
+    """The other ranks, which a first one started."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (folder / "cmdline").read_bytes()
+        except OSError:  # it has ended meanwhile
+            continue
+        if parent == pid and b"prefrl" in command:
+            found.append(int(folder.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Also false for one that has ended, and that nobody has asked about yet."""
+    try:
+        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -1,0 +1,180 @@
+"""What several ranks compute, for tests: cases that each rank goes through in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from runs import small_reviews
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from prefrl import distributed
+from prefrl.components import settings_class
+from prefrl.fit.settings import FittingSettings
+from prefrl.fit.trainer import fit_judged
+from prefrl.improve.dpo import DPOSettings
+from prefrl.improve.text import TextLearnerSettings
+from prefrl.judgements import Comparison, Judged
+from prefrl.protocols import RewardModel
+from prefrl.types import Query, Response, Segment
+
+Found: TypeAlias = dict[str, Tensor]
+Work: TypeAlias = Callable[..., Found]
+
+
+def on_ranks(size: int, folder: Path, work: Work, *arguments: object) -> list[Found]:
+    """What `work` comes to on each rank. It is a function of a module, called with the arguments."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["prefrl.rundir", "torch.utils.tensorboard", "prefrl.envs.text", "transformers"])
+    folder.mkdir()
+    ranks = [context.Process(target=_work, args=(rank, size, folder, work, arguments)) for rank in range(size)]
+    for one in ranks:
+        one.start()
+    for one in ranks:
+        one.join()
+    assert [one.exitcode for one in ranks] == [0] * size
+    return [load_file(folder / f"{rank}.safetensors") for rank in range(size)]
+
+
+def _work(rank: int, size: int, folder: Path, work: Work, arguments: tuple[object, ...]) -> None:
+    torch.set_num_threads(1)
+    distributed.join(rank, size, (folder / "meeting").as_uri())
+    with distributed.together():
+        found = work(*arguments)
+    save_file(found, folder / f"{rank}.safetensors")
+    distributed.leave()
+
+
+def pieces() -> Found:
+    """What a world of ranks is made of, one by one."""
+    world, calls = distributed.world(), []
+    found = {"mine": torch.arange(7)[world.mine].clone(), "ranks": torch.tensor(world.gathered(world.rank))}
+    for count in (0, 1, 2, 3, 7):
+        rows = torch.arange(2 * count).view(count, 2)
+        found[f"whole {count}"] = world.whole(rows[world.mine], count)
+    weights, untouched = torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(1))
+    weights.grad = torch.tensor([float(world.rank), 10.0 * (world.rank == 0)])
+    world.sum_gradients([weights, untouched])
+    assert weights.grad is not None
+    assert untouched.grad is not None
+    found |= {"gradient": weights.grad, "untouched": untouched.grad}
+
+    def say() -> list[int]:
+        calls.append(world.rank)
+        return [40 + distributed.world().rank, distributed.world().size - 1]
+
+    def fail() -> None:
+        calls.append(world.rank)
+        raise ValueError(f"said by rank {world.rank}")
+
+    found["first"] = torch.tensor(world.first(say))
+    try:
+        world.first(fail)
+    except ValueError as error:
+        found["error"] = torch.tensor(list(str(error).encode()))
+    return found | {"calls": torch.tensor([len(calls)])}
+
+
+class Likes:
+    """A reward that likes long responses, and has no score for some."""
+
+    def score(self, candidates: list[Response]) -> Any:
+        found = np.array([len(one.tokens) % 7 + 0.1 * one.tokens[0] % 3 for one in candidates], np.float32)
+        return np.where([one.tokens[0] % 9 == 0 for one in candidates], np.nan, found)
+
+
+LIKES: RewardModel[Response] = Likes()  # type: ignore[assignment]
+BATCH = {"updates": 1, "prompts": 4, "responses": 2, "policy": {"chunk": 3}}
+LEARNERS: dict[str, dict[str, Any]] = {
+    "rloo": BATCH,
+    "rloo, by token": BATCH | {"reduction": "token", "kl_target": 2.0},
+    "rloo, without rows for some": BATCH | {"prompts": 1},
+    "rloo with adapters": BATCH | {"policy": {"train": "lora", "lora_rank": 4}},
+    "grpo": BATCH | {"algorithm": "grpo", "epochs": 2, "minibatches": 2},
+    "reinforce": BATCH | {"algorithm": "reinforce", "prompts": 5, "responses": 1},
+}
+
+
+def policies(cache: Path) -> Found:
+    """Gradient, parameters and metrics of every learner after one round."""
+    task = small_reviews(cache)
+    found: Found = {}
+    for name, settings in LEARNERS.items():
+        learner = TextLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
+        metrics = learner.improve(LIKES, None, np.random.default_rng(1))  # type: ignore[arg-type]
+        found |= dict(learned(name, learner.policy.parameters()))
+        found[f"{name}: metrics"] = torch.tensor([metrics[key] for key in sorted(metrics) if key != "ratio_error"])
+    direct = DPOSettings(minibatch=5, policy={"chunk": 4}).build(task, np.random.default_rng(0))
+    direct.improve(LIKES, Few(direct.sample(12, np.random.default_rng(2))), np.random.default_rng(3))  # type: ignore[arg-type]
+    found |= dict(learned("dpo", direct.policy.parameters()))
+    evaluated = direct.evaluate(LIKES, np.random.default_rng(4)).metrics
+    return found | {"evaluated": torch.tensor([evaluated[key] for key in sorted(evaluated)])}
+
+
+class Few:
+    """A store of pairs in which the first is better."""
+
+    def __init__(self, responses: list[Response]) -> None:
+        queries = [Query((a, b)) for a, b in zip(responses[::2], responses[1::2], strict=True) if a.id != b.id]
+        self._judged = [Judged(query, Comparison(query.id, 1.0)) for query in queries]
+
+    def judged(self, upto: int | None = None) -> list[Judged[Response]]:
+        return self._judged
+
+
+def rewards(cache: Path) -> Found:
+    """Parameters and metrics of fits: for text and for control, of one member and of three."""
+    found: Found = {}
+    pairs = Few(
+        TextLearnerSettings().build(small_reviews(cache), np.random.default_rng(0)).sample(24, _seeded())
+    ).judged()
+    for members in (1, 3):
+        for kind, task, judged, fitting in (
+            ("transformer", small_reviews(cache), pairs, FittingSettings(epochs=1)),
+            ("mlp", ControlTask(), planted_pairs(30), FittingSettings(epochs=1, centre=0.01, reliability="learned")),
+        ):
+            settings: Any = settings_class("rewards", kind)
+            reward = settings(members=members).build(task, np.random.default_rng(0))
+            fitted = fit_judged(reward, judged, fitting, np.random.default_rng(1))
+            found |= dict(learned(f"{kind} of {members}", [p for p in reward.parameters() if p.requires_grad]))
+            values = [fitted.metrics[key] for key in sorted(fitted.metrics)]
+            found[f"{kind} of {members}: metrics"] = torch.tensor(values)
+    return found
+
+
+class ControlTask:
+    """Enough of one to build a reward model for."""
+
+    name, kind, observation_size, action_size, segment_steps, action_bounds = "planted", "control", 3, 2, 5, None
+
+
+def planted_pairs(count: int) -> list[Judged[Segment]]:
+    """Segments of different lengths, of which the one that observed more is better."""
+    rng, found = _seeded(), []
+
+    def segment(name: str, steps: int) -> Segment:
+        observations, actions = (rng.normal(size=(steps, width)).astype(np.float32) for width in (3, 2))
+        return Segment(observations, actions, name, 0)
+
+    for number in range(count):
+        query = Query((segment(f"{number}-a", 5), segment(f"{number}-b", 3 + number % 3)))
+        a, b = (one.observations.sum() for one in query.candidates)
+        found.append(Judged(query, Comparison(query.id, float(a > b), labeler=f"{number % 2}")))
+    return found
+
+
+def _seeded() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def learned(name: str, parameters: list[torch.nn.Parameter]) -> Iterator[tuple[str, Tensor]]:
+    yield f"{name}: parameters", torch.cat([p.detach().flatten() for p in parameters])
+    yield (
+        f"{name}: gradient",
+        torch.cat([torch.zeros(p.numel()) if p.grad is None else p.grad.flatten() for p in parameters]),
+    )

@@ -1,0 +1,58 @@
+"""Several ranks compute what one does, and nobody waits for one that has ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from rank_cases import Work, on_ranks, pieces, policies, rewards
+
+from prefrl import distributed
+from prefrl.distributed import World
+from prefrl.envs.text import Reviews
+
+NOISE = 1e-4
+
+
+def test_a_process_by_itself_is_a_world_of_one_that_changes_nothing() -> None:
+    rows = torch.arange(6.0).view(3, 2)
+    weight = torch.nn.Parameter(torch.ones(2))
+    with distributed.together() as world:
+        assert world == World() == distributed.world() == distributed.joined()
+        assert world.whole(rows[world.mine], 3) is not None
+        assert torch.equal(world.whole(rows[world.mine], 3), rows)
+        assert world.gathered("a") == ["a"]
+        assert world.first(lambda: 7) == 7
+        world.sum_gradients([weight])
+    assert weight.grad is None
+
+
+def test_ranks_share_rows_sum_gradients_and_hear_what_the_first_has_to_say(tmp_path: Path) -> None:
+    found = on_ranks(3, tmp_path / "three", pieces)
+    for rank, one in enumerate(found):
+        for count in (0, 1, 2, 3, 7):  # fewer rows than ranks, and a rest
+            assert torch.equal(one[f"whole {count}"], torch.arange(2 * count).view(count, 2)), (rank, count)
+        assert one["mine"].tolist() == list(range(7))[rank::3]
+        assert one["gradient"].tolist() == [0 + 1 + 2, 10.0]  # the second of rank 0 alone
+        assert one["untouched"].tolist() == [0.0]
+        assert one["ranks"].tolist() == [0, 1, 2]
+        assert one["first"].tolist() == [40, 0]  # rank 0 says it, in a world of its own
+        assert bytes(one["error"].tolist()) == b"said by rank 0"
+        assert one["calls"].tolist() == [2 if rank == 0 else 0]
+
+
+@pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("work", "most"), [(policies, 1e-6), (rewards, 2e-6)])
+def test_an_update_is_the_same_on_any_number_of_ranks(
+    work: Work, most: float, size: int, toy_reviews: Reviews, models: Path, tmp_path: Path
+) -> None:
+    alone = work(models)
+    found = on_ranks(size, tmp_path / "ranks", work, models)
+    for name, expected in alone.items():
+        assert all(torch.equal(found[0][name], one[name]) for one in found), f"{name}: ranks differ"
+        # Adam's first step is about as long for any gradient: where that is 0 but for rounding, it goes either way.
+        slope = alone.get(name.replace("parameters", "gradient"), expected).abs()
+        known = slope > NOISE * slope.max()
+        apart = float(((found[0][name] - expected) * known).norm() / expected.norm())
+        assert apart <= most, f"{name}: {apart:.2g} from one rank"
