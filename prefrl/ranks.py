@@ -14,13 +14,11 @@ from typing import Any, Generic
 import numpy as np
 import torch
 
-from prefrl.components import ConfigError
 from prefrl.config import Config
 from prefrl.distributed import joined, together, world
 from prefrl.judgements import Answer, Judged
-from prefrl.kinds import RESPONSES
 from prefrl.loop import Loop
-from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store
+from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store, text
 from prefrl.seeding import to_numpy
 from prefrl.types import C, Floats, Json, Query, Round
 
@@ -110,8 +108,7 @@ def build(config: Config, store: Store[C] | None) -> Loop[C]:
     loop: Loop[C] = config.build(store)  # type: ignore[arg-type]  # the loop of another rank never looks at it
     if joined().size == 1:
         return loop
-    if loop.task.kind != RESPONSES.name:
-        raise ConfigError(f"{joined().size} ranks share the work on text alone, and the task is of {loop.task.kind}")
+    text(loop.task, f"{joined().size} ranks share the work on text alone")
     return replace(
         loop,
         store=SharedStore(store),

@@ -18,6 +18,8 @@ import typer
 Ranks = Annotated[int, typer.Option(min=1, help="Processes that share the work, for tasks of text.")]
 MEETING = "PREFRL_MEETING"
 """Names, for a process that was started here, the file in which the ranks meet."""
+GRACE = 10.0
+"""Seconds in which the others end by themselves once rank 0 is done."""
 
 
 @contextmanager
@@ -67,10 +69,13 @@ def _started(size: int) -> Iterator[str]:
         try:
             yield meeting
             done.set()
+            for other in others:
+                other.wait(GRACE)
         finally:
             done.set()
             for other in others:
                 other.terminate()
+                other.wait()
 
 
 def _watch(rank: int, process: subprocess.Popen[bytes], done: threading.Event) -> None:

@@ -110,7 +110,7 @@ def test_control_is_refused_in_one_line(tmp_path: Path) -> None:
     refused = started("run", "control/toy", "--ranks", "2", "--out", str(tmp_path / "run"), log=tmp_path / "log")
     assert refused.wait() == 2
     (line,) = (tmp_path / "log").read_text().splitlines()
-    assert line == "error: 2 ranks share the work on text alone, and the task is of control"
+    assert line == "error: 2 ranks share the work on text alone, but the task is of kind 'control'"
 
 
 def children(pid: int) -> list[int]:
