@@ -4,8 +4,8 @@
 
 Each run is the command `prefrl run`, one thread a process, one run after another. `ratio` is the CPU seconds of all
 ranks together over those of one rank: 1 would mean that nothing is done twice. `worst_relative_difference` is that of
-the parameters of policy or reward after a fit and one update (|a - b| / |a|, norms); `ledger_equal` says whether the whole runs
-asked, answered and spent the same, to the last token, in every round.
+the parameters of policy or reward after a fit and one update (|a - b| / |a|, norms); `ledger_equal` says whether the
+whole runs asked, answered and spent the same, to the last token, in every round.
 """
 
 from __future__ import annotations

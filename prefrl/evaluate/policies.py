@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from prefrl.distributed import world
 from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import segment
-from prefrl.types import Evaluation, Floats, Response, Segment
+from prefrl.types import Evaluation, Floats, Integers, Response, Segment
 
 if TYPE_CHECKING:  # a control learner loads no transformers
     from prefrl.policies.language import LanguagePolicy
@@ -21,6 +22,8 @@ if TYPE_CHECKING:  # a control learner loads no transformers
 EXAMPLES, EXAMPLE_SECONDS = 3, 4.0
 """Openings of episodes to look at."""
 EXAMPLE_RESPONSES = 4
+ORDERS = 4
+"""BLEU counts runs of one to so many words."""
 
 
 def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
@@ -48,7 +51,7 @@ def responses(
     """One response at temperature 1 to each of so many evaluation prompts, and how many tokens that took.
 
     Metrics: gold, gold_std, learned, kl (nats per response: the mean log-ratio to the starting policy), length
-    (tokens), ended (share), distinct_1 and distinct_2 (shares), and fluency where the task can tell.
+    (tokens), ended (share), distinct_1, distinct_2, self_bleu, and fluency where the task can tell.
     """
     task = policy.task
     drawn = policy.respond(task.evaluation_prompts(prompts, rng), 1, rng, policy.sampling(1, temperature=1.0))
@@ -66,6 +69,7 @@ def responses(
         metrics["unscored"] = float(np.isnan(scores).mean())
     words = [one.text.split() for one in found]
     metrics |= {f"distinct_{n}": distinct(words, n) for n in (1, 2)}
+    metrics |= {"self_bleu": self_bleu(words)} if len(words) > 1 else {}
     fluent = task.fluency(found)
     metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
     return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count
@@ -90,3 +94,41 @@ def distinct(texts: Sequence[Sequence[str]], n: int) -> float:
     """
     runs = [tuple(words[i : i + n]) for words in texts for i in range(len(words) - n + 1)]
     return len(set(runs)) / max(len(runs), 1)
+
+
+def self_bleu(texts: Sequence[Sequence[str]]) -> float:
+    """How alike two or more texts are: the mean BLEU of each with all others as its references (Zhu et al. 2018).
+
+    Runs of one to four words, as far as a text has them; an order without a match counts as a tenth of a match (Chen
+    and Cherry 2014, method 1). 0 where no text has words.
+    """
+    found = np.zeros((len(texts), ORDERS))  # log precisions; NaN where a text has no runs of that length
+    for n in range(1, ORDERS + 1):
+        counts = [Counter(tuple(text[i : i + n]) for i in range(len(text) - n + 1)) for text in texts]
+        # A reference is any other text: of each run the two highest counts say what the most in the others is.
+        highest: dict[tuple[str, ...], list[int]] = {}
+        for one in counts:
+            for run, count in one.items():
+                highest[run] = sorted((*highest.get(run, ()), count))[-2:]
+        found[:, n - 1] = [_log_precision(one, highest) for one in counts]
+    lengths = np.array([len(text) for text in texts])
+    brevity = [_brevity(i, lengths) for i in range(len(texts))]
+    worded = lengths > 0
+    return float(np.mean(np.exp(np.nanmean(found[worded], 1)) * np.array(brevity)[worded])) if worded.any() else 0.0
+
+
+def _log_precision(own: Counter[tuple[str, ...]], highest: Mapping[tuple[str, ...], list[int]]) -> float:
+    """Of the runs of a text: the log share that others have too, each at most as often as one of them has it."""
+    if not own:
+        return math.nan
+    # Where the text's own count is the highest, the second highest is that of the others.
+    others = {run: highest[run][0] if count == highest[run][-1] else highest[run][-1] for run, count in own.items()}
+    matched = sum(min(count, others[run] if len(highest[run]) > 1 else 0) for run, count in own.items())
+    return math.log(max(matched, 0.1) / own.total())
+
+
+def _brevity(at: int, lengths: Integers) -> float:
+    """BLEU's penalty for a text that is shorter than the other one whose length is nearest."""
+    others = np.delete(lengths, at)
+    nearest = others[np.lexsort((others, abs(others - lengths[at])))[0]]
+    return 1.0 if lengths[at] >= nearest else math.exp(1 - nearest / max(lengths[at], 1))

@@ -82,6 +82,11 @@ class TextLearnerSettings(Settings):
     """End a round's updates once a batch is farther than this from the starting policy, in nats per response."""
     kl_horizon: float = Field(10_000.0, gt=0)
     """Responses over which beta is steered."""
+    reference_every: int | None = Field(None, ge=1)
+    """Move what the KL holds the policy near towards it, each time after so many updates (Gorbatovski et al. 2024);
+    null for the starting policy throughout."""
+    reference_mix: float = Field(0.6, gt=0, le=1)
+    """How far: the share of the policy's parameters in what comes out."""
     reduction: Reduction = "constant"
     """How steps are averaged: `constant` (sums over a response), `token` or `sequence` (see docs)."""
     learning_rate: float = Field(5e-4, gt=0)
@@ -121,6 +126,8 @@ class TextLearnerSettings(Settings):
             raise ValueError("several gradient steps on a batch (epochs x minibatches > 1) need a clip: set clip=0.2")
         if self.minibatches > self.prompts * self.responses:
             raise ValueError(f"{self.prompts} x {self.responses} responses cannot be {self.minibatches} minibatches")
+        if self.reference_every and self.reference_mix < 1 and self.policy.train == "lora":
+            raise ValueError("parts of two adapters are no adapter between the two: with LoRA set reference_mix=1")
         if self.kl_target is not None and self.beta == 0:
             raise ValueError("kl_target steers beta, so beta must start above 0")
         return self
@@ -159,6 +166,8 @@ class TextLearner:
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0
+        self._reference: State = self.policy.state() if settings.reference_every else {}
+        """What the policy's parameters are held near, where that moves."""
 
     @property
     def steps(self) -> Steps:
@@ -182,6 +191,7 @@ class TextLearner:
             for name, value in measured.items():
                 seen[name].append(value)
             self._updates += 1
+            self._move_reference()
             if self._settings.kl_stop is not None and measured["kl"] > self._settings.kl_stop:
                 break
         means = {name: _mean(values) for name, values in seen.items()}
@@ -191,12 +201,16 @@ class TextLearner:
         return self._writer.evaluate(self._settings.evaluation_prompts, reward, rng)
 
     def state(self) -> State:
-        return self._writer.state() | {"updates": self._updates, "beta": self._kl.beta}
+        held = {"updates": self._updates, "beta": self._kl.beta}
+        reference = {name: value.clone() for name, value in self._reference.items()}
+        return self._writer.state() | held | ({"reference": reference} if reference else {})
 
     def load(self, state: State) -> None:
         """Raises ValueError where names or shapes differ."""
         self._writer.load(state)
         self._updates, self._kl = int(state["updates"]), replace(self._kl, beta=float(state["beta"]))
+        for name, value in self._reference.items():
+            value.copy_(state["reference"][name])
 
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
@@ -259,8 +273,16 @@ class TextLearner:
         return self._kl.beta * advantages_of(kls, baseline)
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
-        """(B, L) under the starting policy; where the KL does not count that is not run, and the policy stands in."""
-        return self.policy.start_logp(drawn) if self._measures else drawn.logp
+        """(B, L) under the reference; where the KL does not count that is not run, and the policy stands in."""
+        if not self._measures:
+            return drawn.logp
+        return self.policy.logp_at(self._reference, drawn) if self._reference else self.policy.start_logp(drawn)
+
+    def _move_reference(self) -> None:
+        every, mix = self._settings.reference_every, self._settings.reference_mix
+        if every and self._updates % every == 0:
+            for name, value in self.policy.state().items():
+                self._reference[name].lerp_(value, mix)
 
     @property
     def _measures(self) -> bool:
@@ -332,12 +354,18 @@ def text_formula(settings: TextLearnerSettings) -> str:
     lines = [
         f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
         *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
+        *([_moves(settings)] if settings.reference_every and settings.beta else []),
         f"A_i = {ADVANTAGES[settings.advantage]}{after}",
         f"R_i = {_score(settings)}{in_reward}",
         f"{settings.prompts} prompts x {settings.responses} responses a batch, "
         f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",
     ]
     return "\n".join(lines)
+
+
+def _moves(settings: TextLearnerSettings) -> str:
+    mix = settings.reference_mix
+    return f"ref <- {1 - mix:.2g} ref + {mix:g} pi after each {settings.reference_every} updates"
 
 
 def _score(settings: TextLearnerSettings) -> str:

@@ -181,6 +181,16 @@ class LanguagePolicy:
         with self._at_the_start():
             return all_logp(self.start, responses, temperature, self.part, self._head_alone)
 
+    @torch.no_grad()
+    def logp_at(self, values: State, responses: Responses) -> Tensor:
+        """(B, L) log-probabilities with other values of what learning changes, as in `state`; without gradients."""
+        own = self.state()
+        self.load(values)
+        try:
+            return all_logp(self.model, responses, self.temperature, self.part, self._head_alone)
+        finally:
+            self.load(own)
+
     def with_gold(self, responses: Responses) -> list[Response]:
         """As candidates, gold attached: for what is asked about, and for evaluation."""
         found = responses.candidates(self.task.tokenizer)

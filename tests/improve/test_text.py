@@ -119,6 +119,38 @@ def test_a_round_ends_where_the_policy_has_gone_too_far(toy_reviews: Reviews) ->
     assert kl[1] < 0.7 * kl[0]
 
 
+def test_a_reference_that_moves_is_the_policy_in_part_and_goes_on_where_it_was(toy_reviews: Reviews) -> None:
+    likes = reward(word(toy_reviews))
+    changes = {"updates": 2, "learning_rate": 5e-3, "beta": 0.3, "reference_every": 2, "reference_mix": 0.25}
+    one = learner(toy_reviews, **changes)
+    start = one.policy.state()
+    one.improve(likes, NO_STORE, np.random.default_rng(1))
+    after, moved = one.policy.state(), one.state()["reference"]
+    for name in start:
+        torch.testing.assert_close(moved[name], 0.75 * start[name] + 0.25 * after[name])
+    drawn = one.policy.respond(toy_reviews.prompts(4, np.random.default_rng(2)), 2, np.random.default_rng(3))
+    other = learner(toy_reviews)
+    other.policy.load(moved)
+    found = one._reference_logp(drawn)
+    torch.testing.assert_close(found, other.policy.logp_at(other.policy.state(), drawn))
+    assert not torch.allclose(found, one.policy.start_logp(drawn), atol=1e-3)
+    assert all(torch.equal(value, after[name]) for name, value in one.policy.state().items())  # only looked through
+    resumed = learner(toy_reviews, **changes)
+    resumed.load(one.state())
+    for each in (one, resumed):
+        each.improve(likes, NO_STORE, np.random.default_rng(4))
+    assert torch.equal(flat(one.policy.model), flat(resumed.policy.model))
+
+
+def test_a_reference_of_adapters_moves_all_the_way_or_not_at_all(toy_reviews: Reviews) -> None:
+    with pytest.raises(ValidationError, match="set reference_mix=1"):
+        learner(toy_reviews, reference_every=1, policy={"train": "lora"})
+    one = learner(toy_reviews, reference_every=2, reference_mix=1.0, learning_rate=5e-3, policy={"train": "lora"})
+    one.improve(reward(word(toy_reviews)), NO_STORE, np.random.default_rng(1))
+    drawn = one.policy.respond(toy_reviews.prompts(4, np.random.default_rng(2)), 2, np.random.default_rng(3))
+    torch.testing.assert_close(one._reference_logp(drawn), drawn.logp, atol=1e-4, rtol=1e-4)
+
+
 def test_gold_is_neither_read_nor_attached_while_learning(toy_reviews: Reviews) -> None:
     blind = _WithoutGold(toy_reviews)
     seeing, unseeing = learner(toy_reviews), TextLearnerSettings(**SMALL).build(blind, np.random.default_rng(0))
@@ -189,6 +221,7 @@ def test_an_evaluation_repeats_itself_and_starts_without_kl(toy_reviews: Reviews
         "fluency",
         "distinct_1",
         "distinct_2",
+        "self_bleu",
     }
     assert len(first.examples) == 4
     assert all(r.gold is not None for r in first.examples)
