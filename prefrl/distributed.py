@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import TypeVar, cast
 
 import torch
 import torch.distributed as dist
@@ -57,10 +57,10 @@ class World:
         """What each rank has, in their order."""
         if self.size == 1:
             return [mine]
-        found: list[Any] = [None] * self.size
+        found: list[T | None] = [None] * self.size
         with _heard():
             dist.all_gather_object(found, mine)
-        return found
+        return cast("list[T]", found)
 
     def sum_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Give every rank the sum of all ranks' gradients, to the same bits; a missing one counts as 0."""
@@ -77,17 +77,15 @@ class World:
         """What `call` returns on rank 0, on all ranks; what it raises there, all raise. The others do not call it."""
         if self.size == 1:
             return call()
-        told: list[Any] = [None]
+        found: list[T | Exception | None] = [None]
         if self.rank == 0:
             with alone():  # nobody would answer
-                told = [_outcome(call)]
+                found = [_outcome(call)]
         with _heard():
-            dist.broadcast_object_list(told)
-        found, error = told[0]
-        if error is not None:
-            raise error
-        result: T = found
-        return result
+            dist.broadcast_object_list(found)
+        if isinstance(found[0], Exception):
+            raise found[0]
+        return cast("T", found[0])
 
 
 _joined = World()
@@ -160,8 +158,8 @@ def _heard() -> Iterator[None]:
         ) from error
 
 
-def _outcome(call: Callable[[], T]) -> tuple[T | None, Exception | None]:
+def _outcome(call: Callable[[], T]) -> T | Exception:
     try:
-        return call(), None
+        return call()
     except Exception as error:
-        return None, error
+        return error

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic
+from typing import Generic
 
 import numpy as np
 import torch
@@ -170,7 +170,7 @@ def _digest(*parts: Learner[C] | RewardModel[C]) -> str:
     return found.hexdigest()
 
 
-def _tensors(state: Any) -> Iterator[torch.Tensor]:
+def _tensors(state: object) -> Iterator[torch.Tensor]:
     if isinstance(state, dict):
         for key in state:
             yield from _tensors(state[key])

@@ -79,7 +79,7 @@ def test_a_model_that_is_too_sure_is_found_out_and_mended_on_the_other_half(rng:
 
 
 def test_a_fit_that_knows_of_mistakes_and_ties_is_not_blamed_for_them(rng: np.random.Generator) -> None:
-    some = judged(1500, rng, ("ann", "bob"))
+    some = judged(1000, rng, ("ann", "bob"))
     turned = []
     for one in some:
         assert isinstance(one.judgement, Comparison)
