@@ -7,14 +7,13 @@ samples, fits, improves and evaluates shares its rows (`prefrl.distributed`).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic
 
 import numpy as np
 import torch
 
-from prefrl.config import Config
 from prefrl.distributed import joined, together, world
 from prefrl.judgements import Answer, Judged
 from prefrl.loop import Loop
@@ -31,13 +30,7 @@ class RanksError(RuntimeError):
 class SharedStore(Generic[C]):
     """A `Store` that rank 0 alone has."""
 
-    kept: Store[C] | None
-    """None on the others."""
-
-    @property
-    def own(self) -> Store[C]:
-        assert self.kept is not None  # nobody else comes here
-        return self.kept
+    own: Store[C]
 
     @property
     def sequence(self) -> int:
@@ -100,35 +93,34 @@ class SharedSelector(Generic[C]):
         return world().first(lambda: self.own.select(pool, reward, count, rng))
 
 
-def build(config: Config, store: Store[C] | None) -> Loop[C]:
-    """A run's loop: as `config.build`, and where there are several ranks, one that they go through together.
+def shared(loop: Loop[C]) -> Loop[C]:
+    """The same loop, or where there are several ranks, one that they go through together.
 
-    Raises `ConfigError` for several ranks where the kind of task is not shared out.
+    Other ranks than the first never look at their own store. Raises `ConfigError` where the kind of task is not shared.
     """
-    loop: Loop[C] = config.build(store)  # type: ignore[arg-type]  # the loop of another rank never looks at it
     if joined().size == 1:
         return loop
     text(loop.task, f"{joined().size} ranks share the work on text alone")
     return replace(
         loop,
-        store=SharedStore(store),
+        store=SharedStore(loop.store),
         labeler=SharedLabeler(loop.labeler),
         selector=SharedSelector(loop.selector),
     )
 
 
-def lead(config: Config, loop: Loop[C]) -> None:
+def lead(settings: Json, loop: Loop[C]) -> None:
     """Tell the ranks that `follow` what to run, and from where."""
     with together() as ranks:
-        ranks.first(lambda: config.model_dump(mode="json"))
+        ranks.first(lambda: settings)
         _align(loop)
 
 
-def follow() -> None:
-    """Go through rank 0's run with it, to its end."""
+def follow(build: Callable[[Json], Loop[C]]) -> None:
+    """Go through rank 0's run with it, to its end: a loop that is built, on any store, from what `lead` says."""
     with together() as ranks:
-        told: Json = ranks.first(dict)
-    loop = build(Config.model_validate(told), None)
+        settings: Json = ranks.first(dict)
+    loop = shared(build(settings))
     with together():
         _align(loop)
     for _ in rounds(loop):

@@ -20,7 +20,7 @@ from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Noted, RewardModel, Task
-from prefrl.ranks import build, lead, rounds
+from prefrl.ranks import lead, rounds, shared
 from prefrl.report.examples import save_examples
 from prefrl.report.report import write_report
 from prefrl.seeding import streams
@@ -55,7 +55,7 @@ class Run:
         self.store: Store = Store(self.folder)
         try:
             _claim(config, self.folder, self.store)
-            self.loop: Loop = build(config, self.store)
+            self.loop: Loop = shared(config.build(self.store))
             if isinstance(self.loop.task, Noted):
                 self.notes += self.loop.task.notes
             self._start_from(reward)
@@ -64,7 +64,7 @@ class Run:
             self._events = _events(self.folder, self.loop.round)
             if isinstance(self.loop.labeler, Attended):
                 self.notes += self.loop.labeler.open(self.store)
-            lead(config, self.loop)
+            lead(config.model_dump(mode="json"), self.loop)
         except BaseException:  # Ctrl-C too: a folder must not stay owned by a start that failed
             self.store.close()
             raise

@@ -11,9 +11,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
+
+if TYPE_CHECKING:
+    from prefrl.store import Store
 
 Ranks = Annotated[int, typer.Option(min=1, help="Processes that share the work, for tasks of text.")]
 MEETING = "PREFRL_MEETING"
@@ -36,14 +39,20 @@ def on(ranks: int) -> Iterator[bool]:
         if size > 1:
             join(rank, size, os.environ.get(MEETING, "env://") if told else others.enter_context(_started(size)))
         if rank:
-            from prefrl.ranks import follow
-
             try:
-                follow()
+                _follow()
             except LostRanksError:
                 sys.exit(1)  # rank 0 says why, if it can
         yield not rank
         leave()
+
+
+def _follow() -> None:
+    from prefrl.config import Config
+    from prefrl.ranks import follow
+
+    nowhere = cast("Store", None)  # rank 0 has the store, and says what is in it
+    follow(lambda settings: Config.model_validate(settings).build(nowhere))
 
 
 @contextmanager
