@@ -9,6 +9,7 @@ number of ranks but by rounding. A process by itself is a world of one, where al
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,11 +19,14 @@ from typing import TypeVar, cast
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch._C._distributed_c10d import Store
 
 T = TypeVar("T")
 
 PATIENCE = timedelta(days=365)
 """People may take days to answer; a rank that dies is noticed at once, by its closed connections."""
+MEETING = timedelta(minutes=2)
+"""How long ranks wait for each other at the start."""
 
 
 class LostRanksError(ConnectionError):
@@ -67,11 +71,15 @@ class World:
         if self.size == 1:
             return
         learning = [p for p in parameters if p.requires_grad]
-        flat = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in learning])
+        # Behind them, whether there is one at all: what no rank has a gradient of is left alone by optimisers.
+        some = learning[0].new_tensor([p.grad is not None for p in learning], dtype=torch.float32)
+        gradients = [(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in learning]
+        flat = torch.cat([*gradients, some])
         with _heard():
             dist.all_reduce(flat)
-        for parameter, total in zip(learning, flat.split([p.numel() for p in learning]), strict=True):  # type: ignore[no-untyped-call]
-            parameter.grad = total.view_as(parameter)
+        *totals, some = flat.split([*(p.numel() for p in learning), len(learning)])  # type: ignore[no-untyped-call]
+        for parameter, total, known in zip(learning, totals, some.tolist(), strict=True):
+            parameter.grad = total.view_as(parameter).to(parameter.dtype) if known else None
 
     def first(self, call: Callable[[], T]) -> T:
         """What `call` returns on rank 0, on all ranks; what it raises there, all raise. The others do not call it."""
@@ -119,13 +127,30 @@ def alone() -> Iterator[None]:
 
 
 def join(rank: int, size: int, meeting: str = "env://") -> None:
-    """Meet the other ranks: at an address of torch's `init_method`. On GPUs each rank takes one of its machine's."""
+    """Meet the other ranks: at an address of torch's `init_method`. On GPUs each rank takes one of its machine's.
+
+    All use as many threads as the one with the fewest: sums over other numbers of them round otherwise. Raises
+    `LostRanksError` where somebody does not come.
+    """
     global _joined
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", rank)) % torch.cuda.device_count())
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    dist.init_process_group(backend, init_method=meeting, rank=rank, world_size=size, timeout=PATIENCE)
+    store, rank, size = next(dist.rendezvous(meeting, rank, size, timeout=MEETING))  # type: ignore[attr-defined]
+    _wait_for_all(store, rank, size)
+    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=PATIENCE)
     _joined = World(rank, size)
+    torch.set_num_threads(min(_joined.gathered(torch.get_num_threads())))
+
+
+def _wait_for_all(store: Store, rank: int, size: int) -> None:
+    """A second at a time, so that Ctrl-C is heard."""
+    store.set(f"prefrl {rank}", "here")
+    everybody, begin = [f"prefrl {other}" for other in range(size)], time.monotonic()
+    while not store.check(everybody):
+        if time.monotonic() - begin > MEETING.total_seconds():
+            raise LostRanksError(f"rank {rank} of {size} waited {MEETING.seconds} s for the others, and not all came")
+        time.sleep(0.02)
 
 
 def leave() -> None:

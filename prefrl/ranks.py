@@ -19,7 +19,7 @@ from prefrl.judgements import Answer, Judged
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store, text
 from prefrl.seeding import to_numpy
-from prefrl.types import C, Floats, Json, Query, Round
+from prefrl.types import C, Floats, Json, Query, Round, State
 
 
 class RanksError(RuntimeError):
@@ -111,6 +111,8 @@ def shared(loop: Loop[C]) -> Loop[C]:
 
 def lead(settings: Json, loop: Loop[C]) -> None:
     """Tell the ranks that `follow` what to run, and from where."""
+    if joined().size == 1:
+        return
     with together() as ranks:
         ranks.first(lambda: settings)
         _align(loop)
@@ -145,12 +147,26 @@ def rounds(loop: Loop[C]) -> Iterator[Round[C]]:
 def _align(loop: Loop[C]) -> None:
     """Stand where rank 0 stands."""
     round, sequence, learner, reward = world().first(
-        lambda: (loop.round, loop.sequence, loop.learner.state(), loop.reward.state())
+        # Not from GPU to GPU: each rank would have a copy on that of rank 0.
+        lambda: (loop.round, loop.sequence, _on_cpu(loop.learner.state()), _on_cpu(loop.reward.state()))
     )
     if world().rank:
         loop.round, loop.sequence = round, sequence
         loop.learner.load(learner)
         loop.reward.load(reward)
+
+
+def _on_cpu(state: State) -> State:
+    """The same, with its tensors there."""
+
+    def moved(value: object) -> object:
+        if isinstance(value, dict):
+            return {key: moved(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [moved(one) for one in value]
+        return value.cpu() if isinstance(value, torch.Tensor) else value
+
+    return {key: moved(value) for key, value in state.items()}
 
 
 def _digest(*parts: Learner[C] | RewardModel[C]) -> str:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from prefrl import distributed
 from prefrl.components import settings_class
+from prefrl.evaluate.policies import scored
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
 from prefrl.improve.dpo import DPOSettings
@@ -61,8 +62,7 @@ def pieces() -> Found:
     weights.grad = torch.tensor([float(world.rank), 10.0 * (world.rank == 0)])
     world.sum_gradients([weights, untouched])
     assert weights.grad is not None
-    assert untouched.grad is not None
-    found |= {"gradient": weights.grad, "untouched": untouched.grad}
+    found |= {"gradient": weights.grad, "untouched": torch.tensor([untouched.grad is None])}
 
     def say() -> list[int]:
         calls.append(world.rank)
@@ -144,6 +144,8 @@ def rewards(cache: Path) -> Found:
             found |= dict(learned(f"{kind} of {members}", [p for p in reward.parameters() if p.requires_grad]))
             values = [fitted.metrics[key] for key in sorted(fitted.metrics)]
             found[f"{kind} of {members}: metrics"] = torch.tensor(values)
+            if kind == "transformer":  # one response, which not every rank has
+                found[f"{kind} of {members}: one"] = torch.from_numpy(scored(reward, pairs[0].query.candidates[:1]))
     return found
 
 

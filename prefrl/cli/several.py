@@ -9,20 +9,27 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
+from prefrl.components import Settings
+
 if TYPE_CHECKING:
+    from prefrl.loop import Loop
+    from prefrl.protocols import Labeler
     from prefrl.store import Store
+    from prefrl.types import Json
 
 Ranks = Annotated[int, typer.Option(min=1, help="Processes that share the work, for tasks of text.")]
 MEETING = "PREFRL_MEETING"
 """Names, for a process that was started here, the file in which the ranks meet."""
 GRACE = 10.0
 """Seconds in which the others end by themselves once rank 0 is done."""
+NOTICED = 3.0
+"""Seconds in which rank 0 notices by itself that another has ended, unless it waits for people."""
 
 
 @contextmanager
@@ -51,8 +58,22 @@ def _follow() -> None:
     from prefrl.config import Config
     from prefrl.ranks import follow
 
-    nowhere = cast("Store", None)  # rank 0 has the store, and says what is in it
-    follow(lambda settings: Config.model_validate(settings).build(nowhere))
+    nowhere = cast("Store", None)  # rank 0 has the store and the labeler, and says what came of them
+
+    def build(settings: Json) -> Loop:
+        config = Config.model_validate(settings)
+        return config.model_copy(update={"labeler": _OfRankZero()}).build(nowhere)
+
+    follow(build)
+
+
+class _OfRankZero(Settings):
+    """A labeler that is elsewhere: a judge's model is not loaded twice."""
+
+    kind: Literal["rank 0"] = "rank 0"
+
+    def build(self, task: object) -> Labeler:
+        return cast("Labeler", None)
 
 
 @contextmanager
@@ -78,8 +99,9 @@ def _started(size: int) -> Iterator[str]:
         try:
             yield meeting
             done.set()
-            for other in others:
-                other.wait(GRACE)
+            with suppress(subprocess.TimeoutExpired):
+                for other in others:
+                    other.wait(GRACE)
         finally:
             done.set()
             for other in others:
@@ -90,6 +112,7 @@ def _started(size: int) -> Iterator[str]:
 def _watch(rank: int, process: subprocess.Popen[bytes], done: threading.Event) -> None:
     """Stop rank 0 where another rank ends too early: it may be waiting for people, and would not notice."""
     status = process.wait()
-    if status and not done.is_set():
+    # What rank 0 hears by itself, or went wrong on all ranks, it says itself.
+    if status and not done.wait(NOTICED):
         sys.stderr.write(f"rank {rank} has ended, with status {status}\n")
         _thread.interrupt_main()

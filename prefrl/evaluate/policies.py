@@ -14,6 +14,7 @@ from prefrl.distributed import world
 from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import segment
+from prefrl.seeding import to_numpy
 from prefrl.types import Evaluation, Floats, Integers, Response, Segment
 
 if TYPE_CHECKING:  # a control learner loads no transformers
@@ -77,8 +78,9 @@ def responses(
 
 def scored(reward: RewardModel[Response], candidates: Sequence[Response]) -> Floats:
     """(N,) `reward.score`; ranks share the candidates."""
-    mine = torch.from_numpy(reward.score(candidates[world().mine]))
-    found: Floats = world().whole(mine, len(candidates)).numpy()
+    mine = candidates[world().mine]
+    scores = reward.score(mine).astype(np.float32) if mine else np.zeros(0, np.float32)
+    found: Floats = to_numpy(world().whole(torch.from_numpy(scores), len(candidates)))
     return found
 
 

@@ -73,7 +73,7 @@ class TextLearnerSettings(Settings):
     clip: float | None = Field(None, gt=0)
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
     beta: float = Field(0.3, ge=0)
-    """Weight of the KL to the starting policy, in units of reward a nat."""
+    """Weight of the KL to the starting policy (or to `reference_every`'s), in units of reward a nat."""
     kl_in: Literal["reward", "advantage"] = "reward"
     """Where the KL is taken off: the reward, before the baseline, or the advantage, after it was normalised."""
     kl_target: float | None = Field(None, gt=0)
@@ -128,6 +128,8 @@ class TextLearnerSettings(Settings):
             raise ValueError(f"{self.prompts} x {self.responses} responses cannot be {self.minibatches} minibatches")
         if self.reference_every and self.reference_mix < 1 and self.policy.train == "lora":
             raise ValueError("parts of two adapters are no adapter between the two: with LoRA set reference_mix=1")
+        if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
+            raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
         if self.kl_target is not None and self.beta == 0:
             raise ValueError("kl_target steers beta, so beta must start above 0")
         return self
@@ -209,8 +211,11 @@ class TextLearner:
         """Raises ValueError where names or shapes differ."""
         self._writer.load(state)
         self._updates, self._kl = int(state["updates"]), replace(self._kl, beta=float(state["beta"]))
+        reference = state.get("reference", {})
+        if set(reference) != set(self._reference):
+            raise ValueError("policy: its reference is missing, or is one too many: it was made by other settings")
         for name, value in self._reference.items():
-            value.copy_(state["reference"][name])
+            value.copy_(reference[name])
 
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""

@@ -109,7 +109,8 @@ def generate(
     # All randomness is drawn first, a number for each place: what a row gets hangs neither on when others end, nor on
     # which rank it is on.
     uniform = torch.rand(shape, generator=generator)[world().mine].flatten(0, 1).to(model.device)
-    if mine := prompts[world().mine]:
+    mine = prompts[world().mine]
+    if mine or world().size == 1:
         decoder, logits = _prefill(model, mine, sampling, fast)
         drawn = _decode(decoder, logits, sampling, uniform)
     else:

@@ -142,6 +142,17 @@ def test_a_reference_that_moves_is_the_policy_in_part_and_goes_on_where_it_was(t
     assert torch.equal(flat(one.policy.model), flat(resumed.policy.model))
 
 
+@pytest.mark.parametrize("changes", [{"beta": 0.0}, {"kl_stop": 1.0}])
+def test_a_reference_that_moves_has_something_to_hold_and_stops_nothing(
+    toy_reviews: Reviews, changes: dict[str, object]
+) -> None:
+    with pytest.raises(ValidationError, match="a reference that moves is for beta above 0"):
+        learner(toy_reviews, reference_every=1, **changes)
+    plain = learner(toy_reviews).state()
+    with pytest.raises(ValueError, match="its reference is missing"):
+        learner(toy_reviews, beta=0.1, reference_every=1).load(plain)
+
+
 def test_a_reference_of_adapters_moves_all_the_way_or_not_at_all(toy_reviews: Reviews) -> None:
     with pytest.raises(ValidationError, match="set reference_mix=1"):
         learner(toy_reviews, reference_every=1, policy={"train": "lora"})

@@ -1,6 +1,6 @@
-"""One RLOO update of a 1M-parameter Llama: prefrl's text learner against TRL's RLOOTrainer, at equal work.
+"""One RLOO or GRPO update of a Llama: prefrl's text learner against TRL's trainers, at equal work.
 
-    python benchmarks/text_loop.py [--short] [--peers .venv-peers-text/bin/python]
+    python benchmarks/text_rloo.py [--size 1m|13m] [--algorithm rloo|grpo] [--short] [--peers PYTHON]
 
 Both start from the same weights and prompts: 16 prompts x 4 responses of 48 tokens, KL to a reference at 0.05, one
 Adam step, float32, no dropout, no gradient checkpointing, one thread each. The two processes take turns, an update
@@ -21,14 +21,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-PROMPTS, SAMPLES, NEW_TOKENS, VOCABULARY, PROMPT_TOKENS = 16, 4, 48, 2048, 8
+PROMPTS, SAMPLES, NEW_TOKENS, WORDS, PROMPT_TOKENS = 16, 4, 48, 2048, 8
+SIZES = {"1m": (4, 128, 4, 2048), "13m": (6, 384, 6, 8192)}
+"""Layers, width, heads, vocabulary."""
 BETA, LEARNING_RATE = 0.05, 1e-4
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false"}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--short", action="store_true", help="fewer repetitions: under two minutes")
+    parser.add_argument("--size", choices=SIZES, default="1m")
+    parser.add_argument("--algorithm", choices=("rloo", "grpo"), default="rloo")
+    parser.add_argument("--short", action="store_true", help="fewer repetitions: 1m in under two minutes")
     parser.add_argument(
         "--peers", default=".venv-peers-text/bin/python", help="Python of the environment that holds TRL"
     )
@@ -36,28 +40,31 @@ def main() -> None:
     parser.add_argument("--folder", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
-        {"ours": ours, "peer": peer}[options.worker](Path(options.folder))
+        {"ours": ours, "peer": peer}[options.worker](Path(options.folder), options.algorithm)
         return
     if not Path(options.peers).exists():
         sys.exit(f"no {options.peers}: run `make peers`, or install benchmarks/peers-text.txt and say --peers")
     with tempfile.TemporaryDirectory() as folder:
-        make_model(Path(folder))
-        print(json.dumps(compare(Path(folder), options.peers, 5 if options.short else 20) | {"short": options.short}))
+        make_model(Path(folder), options.size)
+        found = compare(Path(folder), options.peers, options.algorithm, 5 if options.short else 20)
+    work = f"one {options.algorithm.upper()} update, {options.size}, {PROMPTS * SAMPLES} x {NEW_TOKENS} tokens, fp32"
+    print(json.dumps({"name": f"text_rloo: {work}"} | found | {"short": options.short}))
 
 
-def make_model(folder: Path) -> None:
+def make_model(folder: Path, size: str) -> None:
     """Random weights and a tokenizer of whole words, t0 ... t2047, for both sides to read."""
     import torch
     from tokenizers import Tokenizer, models, pre_tokenizers
     from transformers import LlamaConfig, LlamaForCausalLM
 
     torch.manual_seed(0)
+    layers, width, heads, vocabulary = SIZES[size]
     config = LlamaConfig(
-        vocab_size=VOCABULARY,
-        hidden_size=128,
-        intermediate_size=344,
-        num_hidden_layers=4,
-        num_attention_heads=4,
+        vocab_size=vocabulary,
+        hidden_size=width,
+        intermediate_size=width * 43 // 16,
+        num_hidden_layers=layers,
+        num_attention_heads=heads,
         max_position_embeddings=256,
         tie_word_embeddings=True,
         pad_token_id=0,
@@ -65,7 +72,7 @@ def make_model(folder: Path) -> None:
         eos_token_id=2,
     )
     LlamaForCausalLM(config).save_pretrained(folder)
-    words = Tokenizer(models.WordLevel({f"t{i}": i for i in range(VOCABULARY)}, unk_token="t3"))
+    words = Tokenizer(models.WordLevel({f"t{i}": i for i in range(WORDS)}, unk_token="t3"))
     words.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
     words.save(str(folder / "words.json"))
 
@@ -73,7 +80,7 @@ def make_model(folder: Path) -> None:
 def prompts(round: int) -> list[str]:
     """The same 16 prompts for both sides."""
     return [
-        " ".join(f"t{10 + (997 * round + 31 * i + 7 * j) % (VOCABULARY - 10)}" for j in range(PROMPT_TOKENS))
+        " ".join(f"t{10 + (997 * round + 31 * i + 7 * j) % (WORDS - 10)}" for j in range(PROMPT_TOKENS))
         for i in range(PROMPTS)
     ]
 
@@ -83,9 +90,10 @@ def reward_of(tokens: list[int]) -> float:
     return sum(token % 2 == 0 for token in tokens) / len(tokens)
 
 
-def compare(folder: Path, peers: str, repetitions: int) -> dict[str, Any]:
+def compare(folder: Path, peers: str, algorithm: str, repetitions: int) -> dict[str, Any]:
     """Let both sides make an update in turn; the first two are for warming up."""
-    workers = {"ours": start("ours", sys.executable, folder), "peer": start("peer", peers, folder)}
+    sides = {"ours": sys.executable, "peer": peers}
+    workers = {name: start(name, python, folder, algorithm) for name, python in sides.items()}
     seconds: dict[str, list[float]] = {"ours": [], "peer": []}
     for i in range(repetitions + 2):
         for name in ("ours", "peer") if i % 2 else ("peer", "ours"):
@@ -98,7 +106,6 @@ def compare(folder: Path, peers: str, repetitions: int) -> dict[str, Any]:
     medians = {name: statistics.median(values) for name, values in seconds.items()}
     spread = {name: [round(min(values), 4), round(max(values), 4)] for name, values in seconds.items()}
     return {
-        "name": "text_loop: one RLOO update, 1M parameters, 64 x 48 tokens, fp32",
         "unit": "CPU s",
         "ours": round(medians["ours"], 4),
         "peer": round(medians["peer"], 4),
@@ -109,8 +116,8 @@ def compare(folder: Path, peers: str, repetitions: int) -> dict[str, Any]:
     }
 
 
-def start(name: str, python: str, folder: Path) -> subprocess.Popen[str]:
-    command = [python, __file__, "--worker", name, "--folder", str(folder)]
+def start(name: str, python: str, folder: Path, algorithm: str) -> subprocess.Popen[str]:
+    command = [python, __file__, "--worker", name, "--folder", str(folder), "--algorithm", algorithm]
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ONE_THREAD}
     )
@@ -140,7 +147,7 @@ def tell(begin: float, tokens: int) -> None:
     print("RESULT " + json.dumps({"seconds": time.process_time() - begin, "tokens": tokens}), flush=True)
 
 
-def ours(folder: Path) -> None:
+def ours(folder: Path, algorithm: str) -> None:
     import numpy as np
     import torch
     from transformers import LlamaForCausalLM, PreTrainedTokenizerFast
@@ -160,9 +167,9 @@ def ours(folder: Path) -> None:
         prompts=lambda count, rng: prompts(next(rounds)),
     )
     reward: Any = SimpleNamespace(score=lambda found: np.array([reward_of(list(r.tokens)) for r in found], np.float32))
-    settings = TextLearnerSettings(
-        updates=1, prompts=PROMPTS, responses=SAMPLES, beta=BETA, learning_rate=LEARNING_RATE, missing_end_penalty=0.0
-    )
+    sizes = {"updates": 1, "prompts": PROMPTS, "responses": SAMPLES}
+    steps = {"beta": BETA, "learning_rate": LEARNING_RATE, "missing_end_penalty": 0.0}
+    settings = TextLearnerSettings.model_validate({"algorithm": algorithm, **sizes, **steps})
     store: Any = None
     learner, rng = settings.build(task, np.random.default_rng(0)), np.random.default_rng(1)
     while True:
@@ -171,11 +178,11 @@ def ours(folder: Path) -> None:
         tell(begin, learner.steps.learn - before)
 
 
-def peer(folder: Path) -> None:
+def peer(folder: Path, algorithm: str) -> None:
     import torch
     from datasets import Dataset
     from transformers import PreTrainedTokenizerFast, TrainerCallback
-    from trl import RLOOConfig, RLOOTrainer
+    from trl import GRPOConfig, GRPOTrainer, RLOOConfig, RLOOTrainer
 
     torch.set_num_threads(1)
     tokenizer = PreTrainedTokenizerFast(
@@ -197,7 +204,8 @@ def peer(folder: Path) -> None:
             tell(self.begin, counts[-1])
             self.begin = wait()
 
-    config = RLOOConfig(
+    settings, trainer = {"rloo": (RLOOConfig, RLOOTrainer), "grpo": (GRPOConfig, GRPOTrainer)}[algorithm]
+    config = settings(
         output_dir=str(folder / "peer"),
         per_device_train_batch_size=PROMPTS * SAMPLES,
         num_generations=SAMPLES,
@@ -224,7 +232,7 @@ def peer(folder: Path) -> None:
         model_init_kwargs={"dtype": torch.float32},
     )
     data = Dataset.from_dict({"prompt": [p for i in range(50) for p in prompts(i)]})
-    RLOOTrainer(str(folder), score, config, data, processing_class=tokenizer, callbacks=[Turns()]).train()
+    trainer(str(folder), score, config, data, processing_class=tokenizer, callbacks=[Turns()]).train()
 
 
 if __name__ == "__main__":
