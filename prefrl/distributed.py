@@ -144,7 +144,7 @@ def join(rank: int, size: int, meeting: str = "env://") -> None:
 
 
 def _wait_for_all(store: Store, rank: int, size: int) -> None:
-    """A second at a time, so that Ctrl-C is heard."""
+    """In short steps, so that Ctrl-C is heard meanwhile."""
     store.set(f"prefrl {rank}", "here")
     everybody, begin = [f"prefrl {other}" for other in range(size)], time.monotonic()
     while not store.check(everybody):
