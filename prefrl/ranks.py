@@ -9,11 +9,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic
+from typing import Generic, Literal, cast
 
 import numpy as np
 import torch
 
+from prefrl.components import Settings
 from prefrl.distributed import joined, together, world
 from prefrl.judgements import Answer, Judged
 from prefrl.loop import Loop
@@ -81,6 +82,15 @@ class SharedLabeler(Generic[C]):
     def close(self) -> None:
         if isinstance(self.own, Attended):
             self.own.close()
+
+
+class Elsewhere(Settings):
+    """The labeler of other ranks than the first: nobody, so that a judge's model is not loaded by all of them."""
+
+    kind: Literal["elsewhere"] = "elsewhere"
+
+    def build(self, task: object) -> Labeler[C]:
+        return cast("Labeler[C]", None)
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from prefrl.components import Settings
-
 if TYPE_CHECKING:
     from prefrl.loop import Loop
-    from prefrl.protocols import Labeler
     from prefrl.store import Store
     from prefrl.types import Json
 
@@ -56,24 +53,15 @@ def on(ranks: int) -> Iterator[bool]:
 
 def _follow() -> None:
     from prefrl.config import Config
-    from prefrl.ranks import follow
+    from prefrl.ranks import Elsewhere, follow
 
     nowhere = cast("Store", None)  # rank 0 has the store and the labeler, and says what came of them
 
     def build(settings: Json) -> Loop:
         config = Config.model_validate(settings)
-        return config.model_copy(update={"labeler": _OfRankZero()}).build(nowhere)
+        return config.model_copy(update={"labeler": Elsewhere()}).build(nowhere)
 
     follow(build)
-
-
-class _OfRankZero(Settings):
-    """A labeler that is elsewhere: a judge's model is not loaded twice."""
-
-    kind: Literal["rank 0"] = "rank 0"
-
-    def build(self, task: object) -> Labeler:
-        return cast("Labeler", None)
 
 
 @contextmanager
