@@ -7,12 +7,12 @@ It knows the shapes of Llama, Mistral, Qwen, Phi, GPT-2 and GPT-NeoX, in float32
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
-from torch.nn.functional import layer_norm, linear, rms_norm
+from torch.nn.functional import layer_norm, linear
 from transformers import (
     Cache,
     GPT2LMHeadModel,
@@ -37,8 +37,15 @@ class Affine:
     """(out, in)."""
     bias: Tensor | None = None
 
-    def __call__(self, x: Tensor) -> Tensor:
-        return linear(x, self.weight, self.bias)
+    def __call__(self, x: Tensor, beside: Tensor | None = None) -> Tensor:
+        """`beside`: what the result is added to, where there is no bias to add."""
+        if beside is None:
+            return linear(x, self.weight, self.bias)
+        return torch.addmm(beside if self.bias is None else beside + self.bias, x, self.weight.T)
+
+    def laid_out(self) -> Affine:
+        """The same, its matrix in memory as (in, out): a product with few rows is a sixth faster so."""
+        return Affine(self.weight.T.contiguous().T, self.bias)
 
     def after(self, norm: Module) -> Affine:
         """The same on what a norm gives before its own weight n and bias c: W (n x + c) + b = (W n) x + (W c + b)."""
@@ -59,6 +66,10 @@ class Layer:
     down: Affine
     head_norms: tuple[Tensor, Tensor] | None = None
     """Weights of norms over each query, scaled, and each key."""
+
+    def laid_out(self) -> Layer:
+        qkv, out, up, down = (one.laid_out() for one in (self.qkv, self.out, self.up, self.down))
+        return Layer(qkv, out, up, down, self.head_norms)
 
 
 @dataclass(frozen=True)
@@ -93,7 +104,8 @@ def plan(model: PreTrainedModel, length: int) -> Plan | None:
     window = getattr(config, "sliding_window", None)
     if rope.get("rope_type", "default") != "default" or (window is not None and length > window):
         return None
-    return make(model)
+    found = make(model)
+    return found and replace(found, layers=tuple(layer.laid_out() for layer in found.layers))
 
 
 class FastDecoder:
@@ -110,6 +122,7 @@ class FastDecoder:
             # (1, T + room, R): computed for every position at once; of the embedding only device and dtype are read.
             cos, sin = plan.rotary(plan.embedding, torch.arange(self._at + room, device=mask.device)[None])
             self._cos, self._sin = cos[0], sin[0]
+            self._sin[:, : self._sin.shape[1] // 2] *= -1  # of the half that is turned towards minus the other
 
     def step(self, tokens: Tensor) -> Tensor:
         plan = self._plan
@@ -123,12 +136,8 @@ class FastDecoder:
             normed = self._normed(x)
             q, k, v = self._project(layer, layer.qkv(normed), turns)
             keys[:, self._at], values[:, self._at] = k, v  # in place, into room that was made for it
-            attended = layer.out(self._attend(q, keys, values))
-            if plan.parallel:
-                x = x + attended + self._perceptron(layer, normed)
-            else:
-                x = x + attended
-                x = x + self._perceptron(layer, self._normed(x))
+            x = layer.out(self._attend(q, keys, values), x)
+            x = self._perceptron(layer, normed if plan.parallel else self._normed(x), x)
         self._at += 1
         self._positions = self._positions + 1
         return plan.head(self._normed(x))
@@ -147,11 +156,12 @@ class FastDecoder:
             return _root_normed(x, self._plan.eps)
         return layer_norm(x, x.shape[-1:], eps=self._plan.eps)
 
-    def _perceptron(self, layer: Layer, normed: Tensor) -> Tensor:
+    def _perceptron(self, layer: Layer, normed: Tensor, x: Tensor) -> Tensor:
+        """x and what the perceptron makes of `normed`."""
         if not self._plan.gated:
-            return layer.down(self._plan.act(layer.up(normed)))
+            return layer.down(self._plan.act(layer.up(normed)), x)
         gate, up = layer.up(normed).chunk(2, -1)
-        return layer.down(self._plan.act(gate) * up)
+        return layer.down(self._plan.act(gate) * up, x)
 
     def _project(self, layer: Layer, qkv: Tensor, turns: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor, Tensor]:
         """(B, .) -> queries (B x G, heads of a group, D), keys and values (B x G, D); rotary where it belongs."""
@@ -176,15 +186,18 @@ class FastDecoder:
 
 
 def _root_normed(x: Tensor, eps: float) -> Tensor:
-    return rms_norm(x, x.shape[-1:], eps=eps)
+    # Half the time of torch's rms_norm, which goes through x several times on a CPU.
+    root = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+    return x * torch.addcmul(root.new_full((), eps), root, root, value=1 / x.shape[-1]).rsqrt_()
 
 
 def _turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotary positions (Su et al. 2021) on the first R of D dimensions, whose halves turn together."""
+    """Rotary positions (Su et al. 2021) on the first R of D dimensions, whose halves turn together; `sin` is negative
+    for the first half."""
     width = cos.shape[-1]
     turning, rest = x[..., :width], x[..., width:]
     half = width // 2
-    turned = turning * cos + torch.cat([-turning[..., half:], turning[..., :half]], -1) * sin
+    turned = torch.addcmul(turning * cos, torch.cat([turning[..., half:], turning[..., :half]], -1), sin)
     return torch.cat([turned, rest], -1) if rest.shape[-1] else turned
 
 

@@ -206,10 +206,15 @@ def _narrowed(logits: Tensor, sampling: Sampling) -> Tensor:
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
     """(B, V) logits and (B,) numbers in [0, 1) -> (B,) tokens, by inverting the CDF; (B,) their log-probabilities."""
     # In float32: bfloat16 would lose two or three digits of every log-probability.
-    logp = (logits.float() / temperature).log_softmax(-1)
-    cdf = logp.exp().cumsum(-1)
+    share = tempered(logits, temperature).softmax(-1)
+    cdf = share.cumsum(-1)
     total = cdf[:, -1:]
     # Rounding must not reach the total itself: the last token would be taken even where its probability is 0.
     target = torch.minimum(uniform[:, None] * total, torch.nextafter(total, torch.zeros_like(total)))
     tokens = torch.searchsorted(cdf, target, right=True)
-    return tokens[:, 0], logp.gather(1, tokens)[:, 0]
+    return tokens[:, 0], share.gather(1, tokens)[:, 0].log()  # what was drawn has a share above 0
+
+
+def tempered(logits: Tensor, temperature: float) -> Tensor:
+    """Logits in float32 at a temperature; a division by 1 would change nothing and read them all."""
+    return logits.float() if temperature == 1 else logits.float() / temperature

@@ -18,7 +18,7 @@ from transformers import GenerationConfig, PreTrainedModel, PreTrainedTokenizerB
 from prefrl.components import Settings
 from prefrl.distributed import world
 from prefrl.policies.exact import check_exact, rows_of_embedding
-from prefrl.policies.generate import Sampling, generate
+from prefrl.policies.generate import Sampling, generate, tempered
 from prefrl.policies.pretrained import context_of, quiet
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator
@@ -259,7 +259,7 @@ def response_logp(model: PreTrainedModel, responses: Responses, temperature: flo
         kept = model(input_ids=ids, use_cache=False, logits_to_keep=ids.shape[1] - first).logits
         logits = kept[rows, places - 1 - first]
     # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
-    found = -torch.nn.functional.cross_entropy(logits.float() / temperature, chosen, reduction="none")
+    found = -torch.nn.functional.cross_entropy(tempered(logits, temperature), chosen, reduction="none")
     return found.new_zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
 
 

@@ -167,8 +167,11 @@ def test_what_is_enumerated_is_everything_and_the_optimum_is_the_tilted_start(so
 @pytest.mark.parametrize("name", CLAIMING)
 def test_a_learner_that_is_at_the_optimum_stays_there(solved: Any, name: str) -> None:
     task, best = solved
-    at = dict(best.named_parameters())
-    after = improved(task, at, 20, 1e-3, CLAIMING[name])
+    at, changes = dict(best.named_parameters()), CLAIMING[name]
+    # Adam makes steps of one size, of noise as well: they are small, so that what is seen is where the objective pulls,
+    # and smaller where four are made on the noise of one batch.
+    rate = 5e-5 if "clip" in changes else 4e-4
+    after = improved(task, at, 40, rate, changes)
     reference = logp(task.start).detach()
     with torch.no_grad():
         found, before = logp(after.policy.model), logp(best)
