@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from prefrl.components import Settings
-from prefrl.policies.language import pad_right
+from prefrl.policies.responses import pad_right
 from prefrl.protocols import Task, text
 from prefrl.reward_models.backbone import Backbone, Train, digest, of_folder, of_policy, trainable
 from prefrl.reward_models.ensemble import Ensemble, combine

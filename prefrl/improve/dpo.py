@@ -19,7 +19,8 @@ from prefrl.fit.pairs import Batch, batch
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import dpo_loss
 from prefrl.improve.writer import Writer
-from prefrl.policies.language import LanguageSettings, Responses
+from prefrl.policies.language import LanguageSettings
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device
 from prefrl.types import Evaluation, Integers, Metrics, Response, State, Steps

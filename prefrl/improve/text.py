@@ -35,7 +35,8 @@ from prefrl.improve.objectives import (
     step_rewards,
 )
 from prefrl.improve.writer import Writer
-from prefrl.policies.language import LanguageSettings, Responses
+from prefrl.policies.language import LanguageSettings
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device, generator
 from prefrl.types import Evaluation, Metrics, Response, State, Steps

@@ -9,7 +9,8 @@ import numpy as np
 
 from prefrl.evaluate.policies import responses
 from prefrl.improve.gradient import adam
-from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, TextTask
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Response, State, Steps

@@ -1,11 +1,10 @@
-"""A language model as a policy, and responses as tensors: sampled once, scored by forward passes, never decoded and
-encoded again in between."""
+"""A language model as a policy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,84 +12,18 @@ import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
-from transformers import GenerationConfig, PreTrainedModel, PreTrainedTokenizerBase
+from transformers import GenerationConfig, PreTrainedModel
 
 from prefrl.components import Settings
-from prefrl.distributed import world
-from prefrl.policies.exact import check_exact, rows_of_embedding
-from prefrl.policies.generate import Sampling, generate, tempered
+from prefrl.policies.exact import check_exact
+from prefrl.policies.generate import Sampling, generate
+from prefrl.policies.logprobs import all_logp, head_alone, response_logp
 from prefrl.policies.pretrained import context_of, quiet
+from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator
 from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
-
-
-@dataclass(frozen=True, eq=False)
-class Responses:
-    """B responses, K to each prompt, all of the first prompt first."""
-
-    prompts: tuple[str, ...]
-    """Each row's own."""
-    prompt_tokens: tuple[tuple[int, ...], ...]
-    tokens: Tensor
-    """(B, L) int64, right-padded."""
-    mask: Tensor
-    """(B, L) bool: the real tokens, the end token included."""
-    logp: Tensor
-    """(B, L) float32: log-probabilities at sampling; 0 on padding, and where nobody sampled them here."""
-    ended: Tensor
-    """(B,) bool: whether there is an end token."""
-
-    def __len__(self) -> int:
-        return len(self.prompts)
-
-    @property
-    def count(self) -> int:
-        """How many tokens were generated."""
-        return int(self.mask.sum())
-
-    def rows(self, at: Tensor) -> Responses:
-        """Some rows, cut to the longest of them."""
-        width = int(self.mask[at].sum(1).max())
-        tokens, mask, logp = (x[at, :width] for x in (self.tokens, self.mask, self.logp))
-        chosen = at.tolist()
-        prompts, prompt_tokens = tuple(self.prompts[i] for i in chosen), tuple(self.prompt_tokens[i] for i in chosen)
-        return Responses(prompts, prompt_tokens, tokens, mask, logp, self.ended[at])
-
-    def lengths(self) -> Tensor:
-        """(B,) tokens of prompt and response together."""
-        return self.mask.sum(1) + self.mask.new_tensor([len(p) for p in self.prompt_tokens], dtype=torch.int64)
-
-    def parts(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
-        """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
-        for at in self.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
-            yield at, self.rows(at)
-
-    @classmethod
-    def of(cls, candidates: Sequence[Response], task: TextTask, device: torch.device | None = None) -> Responses:
-        """Responses that were sampled as they were; those that came as text alone are encoded, an end token added."""
-        pairs = []
-        for one in candidates:
-            # Text that is encoded anew can merge across the border, into tokens that nobody sampled.
-            prompt = one.prompt_tokens or task.encode(one.prompt)
-            tokens = one.tokens or (*task.tokenizer.encode(one.text, add_special_tokens=False), task.ends[0])
-            pairs.append((prompt, tokens))
-        padded, lengths = pad_right([tokens for _, tokens in pairs], device)
-        mask = torch.arange(padded.shape[1], device=device) < lengths[:, None]
-        ended = torch.tensor([tokens[-1] in task.ends for _, tokens in pairs], device=device)
-        # a mask is filled row by row
-        texts, unknown = tuple(one.prompt for one in candidates), torch.zeros(mask.shape, device=device)
-        return cls(texts, tuple(prompt for prompt, _ in pairs), padded, mask, unknown, ended)
-
-    def candidates(self, tokenizer: PreTrainedTokenizerBase) -> list[Response]:
-        """The same as the vocabulary's `Response`s, without gold."""
-        found = []
-        for i, prompt in enumerate(self.prompts):
-            tokens = self.tokens[i, self.mask[i]].tolist()
-            text = str(tokenizer.decode(tokens, skip_special_tokens=True))
-            found.append(Response(prompt, text, self.prompt_tokens[i], tuple(tokens)))
-        return found
 
 
 class LanguageSettings(Settings):
@@ -238,62 +171,6 @@ class LanguagePolicy:
         return response_logp(self.model, rows, 1.0, self._head_alone)
 
 
-def response_logp(model: PreTrainedModel, responses: Responses, temperature: float, head_alone: bool = True) -> Tensor:
-    """(B, L) float32 log-probabilities of the responses' tokens, differentiable; 0 on padding.
-
-    Rows are padded on the right, where a causal model never looks: no attention mask and no position ids are needed.
-    Where the logits are the head's output alone, it runs on the real tokens of the responses only.
-    """
-    rows, steps = responses.mask.nonzero(as_tuple=True)  # (n,), (n,): the n real tokens, row by row
-    prompts, lengths = pad_right(responses.prompt_tokens, responses.mask.device)
-    places = lengths[rows] + steps  # (n,): the column of each, after its prompt
-    ids = prompts.new_zeros(len(responses), int(places.max()) + 1)  # padded with 0, which is a valid id
-    ids[:, : prompts.shape[1]] = prompts
-    chosen = responses.tokens[rows, steps]
-    ids[rows, places] = chosen
-    if head_alone:
-        hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
-        logits = head_logits(model, hidden[rows, places - 1])  # (n, V): the state before a token predicts it
-    else:
-        first = int(lengths.min()) - 1  # the first column whose logits are wanted
-        kept = model(input_ids=ids, use_cache=False, logits_to_keep=ids.shape[1] - first).logits
-        logits = kept[rows, places - 1 - first]
-    # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
-    found = -torch.nn.functional.cross_entropy(tempered(logits, temperature), chosen, reduction="none")
-    return found.new_zeros(responses.mask.shape).masked_scatter(responses.mask, found)  # (n,) -> (B, L), row by row
-
-
-@torch.no_grad()
-def all_logp(
-    model: PreTrainedModel, responses: Responses, temperature: float, part: int, head_alone: bool = True
-) -> Tensor:
-    """`response_logp` without gradients, a part of the rows at a time; ranks share the rows."""
-    found = torch.zeros(responses.mask.shape, device=responses.mask.device)[world().mine]
-    if len(found):
-        mine = responses if world().size == 1 else responses.rows(torch.arange(len(responses))[world().mine])
-        for at, rows in mine.parts(part):
-            # a part is cut to its longest row
-            found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, head_alone)
-    return world().whole(found, len(responses))
-
-
-def head_logits(model: PreTrainedModel, hidden: Tensor) -> Tensor:
-    """The language model's head, on hidden states of any shape (..., d)."""
-    head = model.get_output_embeddings()  # type: ignore[no-untyped-call]
-    logits: Tensor = head(hidden)
-    return logits
-
-
-@torch.no_grad()
-def head_alone(model: PreTrainedModel) -> bool:
-    """Whether a model's logits are its head's output, and nothing is done to them (soft caps, scales)."""
-    ids = torch.arange(8, device=model.device)[None] * 7919 % rows_of_embedding(model)  # tokens that are far apart
-    direct = model(input_ids=ids, use_cache=False).logits
-    ours = head_logits(model, model.base_model(input_ids=ids, use_cache=False).last_hidden_state)
-    # Hardly a cap shows on small logits: the bits must be the same, or nearly.
-    return bool((direct - ours).abs().max() <= 1e-6 * direct.abs().max())
-
-
 def save_model(model: PreTrainedModel, task: TextTask, folder: Path, adapter: bool) -> None:
     """Write a model, or its adapters alone, with its tokenizer and what ends its responses."""
     with whole_folder(folder) as work, quiet():
@@ -316,10 +193,3 @@ def merged_of(model: PreTrainedModel) -> PreTrainedModel:
     from prefrl.policies.lora import merged  # peft takes seconds to load
 
     return merged(model)
-
-
-def pad_right(rows: Sequence[Sequence[int]], device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """(N, L) int64 token ids, right-padded with 0, which is a valid id; and how many of each row are real (N,)."""
-    width = max(map(len, rows))
-    ids = torch.tensor([[*row, *[0] * (width - len(row))] for row in rows], dtype=torch.int64, device=device)
-    return ids, torch.tensor([len(row) for row in rows], device=device)

@@ -59,7 +59,7 @@ def test_prompts_a_model_and_a_function_give_a_tuned_model_in_two_commands(
     assert prefrl("export run --form policy --to tuned") == 0
     assert "AutoModelForCausalLM.from_pretrained reads it" in prefrl.out
 
-    from prefrl.policies.language import Responses
+    from prefrl.policies.responses import Responses
     from prefrl.stages import policy_of
     from prefrl.types import Response
 

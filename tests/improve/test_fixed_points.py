@@ -19,7 +19,8 @@ from torch import Tensor
 from transformers import LlamaConfig, LlamaForCausalLM
 
 from prefrl.improve.text import TextLearner, TextLearnerSettings
-from prefrl.policies.language import Responses, response_logp
+from prefrl.policies.logprobs import response_logp
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, TextTask
 from prefrl.types import Floats, Response
 

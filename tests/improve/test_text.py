@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
 from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
-from prefrl.policies.language import Responses
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
 

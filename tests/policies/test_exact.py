@@ -13,7 +13,8 @@ from torch import Tensor
 from prefrl.components import ConfigError
 from prefrl.policies.exact import check_exact
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.language import Responses, head_alone, response_logp
+from prefrl.policies.logprobs import head_alone, response_logp
+from prefrl.policies.responses import Responses
 
 
 def rows_of(prompts: Sequence[Sequence[int]], tokens: Tensor, mask: Tensor) -> Responses:

@@ -10,7 +10,8 @@ from transformers import GPT2Config, GPT2LMHeadModel, LlamaConfig, LlamaForCausa
 
 from prefrl.policies.decoder import plan
 from prefrl.policies.generate import Generation, Sampling, draw, generate, pad_left
-from prefrl.policies.language import Responses, all_logp, response_logp
+from prefrl.policies.logprobs import all_logp, response_logp
+from prefrl.policies.responses import Responses
 
 V = 50
 PROMPTS = [[1, 7, 8, 9, 10, 11], [1, 5], [1, 20, 21], [1]]

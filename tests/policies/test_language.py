@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from prefrl.envs.text import Reviews
-from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings
+from prefrl.policies.responses import Responses
 
 
 def test_sampled_responses_come_back_token_for_token(toy_reviews: Reviews, rng: np.random.Generator) -> None:

@@ -17,8 +17,9 @@ from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
 from prefrl.improve.text import TextLearner, TextLearnerSettings
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.language import LanguagePolicy, LanguageSettings, Responses
+from prefrl.policies.language import LanguagePolicy, LanguageSettings
 from prefrl.policies.lora import add_adapters, without_adapters
+from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response
 
