@@ -347,8 +347,8 @@ class Inputs(Protocol):
     def rows(self, at: torch.Tensor) -> Self:
         """Some sequences, cut to the longest of them."""
 
-    def lengths(self) -> torch.Tensor:
-        """(B,) how much each sequence costs to go through, context included."""
+    def order(self) -> torch.Tensor:
+        """(B,): in which order sequences go through a network in parts, so that those of a part are like each other."""
 
 
 I = TypeVar("I", bound=Inputs)  # noqa: E741

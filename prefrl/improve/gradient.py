@@ -79,13 +79,12 @@ class Batch(Generic[I]):
         return Batch(inputs, logp, advantages, cut(self.returns))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
-        """This rank's sequences, at most `size` of like length at a time, so that little padding is computed on; all
-        at once for None."""
+        """This rank's sequences, at most `size` at a time, those together that are like each other; all at once for
+        None."""
         if size is None and world().size == 1:
             yield self
             return
-        # Stable: rows of equal length keep their order, so that the same seed rounds in the same way.
-        mine = self.inputs.lengths().argsort(stable=True)[world().mine]
+        mine = self.inputs.order()[world().mine]
         if len(mine):  # there may be fewer sequences than ranks
             for at in mine.split(size or len(mine)):  # type: ignore[no-untyped-call]
                 yield self.rows(at)

@@ -25,6 +25,8 @@ from transformers import (
     Qwen3ForCausalLM,
 )
 
+from prefrl.policies.pretrained import window_of
+
 Module: TypeAlias = Any
 """A part of a model of transformers, whose parts have no types."""
 
@@ -101,7 +103,7 @@ def plan(model: PreTrainedModel, length: int) -> Plan | None:
         return None
     config: Module = model.config
     rope = getattr(config, "rope_parameters", None) or {"rope_type": "default"}
-    window = getattr(config, "sliding_window", None)
+    window = window_of(model)
     if rope.get("rope_type", "default") != "default" or (window is not None and length > window):
         return None
     found = make(model)

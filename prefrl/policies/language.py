@@ -17,7 +17,7 @@ from transformers import GenerationConfig, PreTrainedModel
 from prefrl.components import Settings
 from prefrl.policies.exact import check_exact
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.logprobs import all_logp, head_alone, response_logp
+from prefrl.policies.logprobs import all_logp, response_logp, shortcuts_of
 from prefrl.policies.pretrained import context_of, quiet
 from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
@@ -53,7 +53,7 @@ class LanguagePolicy:
     ) -> None:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
         self.model = task.model()
-        self._head_alone = head_alone(self.model)
+        self._shortcuts = shortcuts_of(self.model)
         check_exact(self.model, self._probe)
         if settings.train == "full":
             self.start = task.model().requires_grad_(False)  # a second copy of the weights
@@ -76,7 +76,7 @@ class LanguagePolicy:
         return list(self._trained().values())
 
     def log_prob(self, inputs: Responses) -> tuple[Tensor, None]:
-        return response_logp(self.model, inputs, self.temperature, self._head_alone), None
+        return response_logp(self.model, inputs, self.temperature, self._shortcuts), None
 
     def values(self, inputs: Responses) -> Tensor:
         raise ValueError("a language model without a critic has no values: set the weight of the critic's loss to 0")
@@ -112,7 +112,7 @@ class LanguagePolicy:
         self._check_room(int(responses.lengths().max()))
         temperature = self.temperature if temperature is None else temperature
         with self._at_the_start():
-            return all_logp(self.start, responses, temperature, self.part, self._head_alone)
+            return all_logp(self.start, responses, temperature, self.part, self._shortcuts)
 
     @torch.no_grad()
     def logp_at(self, values: State, responses: Responses) -> Tensor:
@@ -120,7 +120,7 @@ class LanguagePolicy:
         own = self.state()
         self.load(values)
         try:
-            return all_logp(self.model, responses, self.temperature, self.part, self._head_alone)
+            return all_logp(self.model, responses, self.temperature, self.part, self._shortcuts)
         finally:
             self.load(own)
 
@@ -168,7 +168,7 @@ class LanguagePolicy:
 
     def _probe(self, prompts: Sequence[Sequence[int]], tokens: Tensor, mask: Tensor) -> Tensor:
         rows = Responses(("",) * len(prompts), tuple(map(tuple, prompts)), tokens, mask, mask.float(), mask[:, -1])
-        return response_logp(self.model, rows, 1.0, self._head_alone)
+        return response_logp(self.model, rows, 1.0, self._shortcuts)
 
 
 def save_model(model: PreTrainedModel, task: TextTask, folder: Path, adapter: bool) -> None:

@@ -74,8 +74,8 @@ class Decisions:
     def rows(self, at: Tensor) -> Decisions:
         return Decisions(self.observations[at], self.choices[at], None if self.legal is None else self.legal[at])
 
-    def lengths(self) -> Tensor:
-        return self.choices.new_ones(len(self.choices), dtype=torch.int64)
+    def order(self) -> Tensor:
+        return torch.arange(len(self.choices), device=self.choices.device)
 
 
 class MLPPolicy:

@@ -79,6 +79,11 @@ def context_of(model: PreTrainedModel) -> int | None:
     return None if known is None else int(known)
 
 
+def window_of(model: PreTrainedModel) -> int | None:
+    """How many tokens back a token looks, where attention has such a window."""
+    return getattr(model.config, "sliding_window", None) or None
+
+
 def first_line(error: Exception) -> str:
     """What went wrong; the advice that libraries add is for others."""
     return str(error).strip().partition("\n")[0]

@@ -45,13 +45,26 @@ class Responses:
         prompts, prompt_tokens = tuple(self.prompts[i] for i in chosen), tuple(self.prompt_tokens[i] for i in chosen)
         return Responses(prompts, prompt_tokens, tokens, mask, logp, self.ended[at])
 
+    @property
+    def repeat_prompts(self) -> bool:
+        """Whether some prompt has several rows."""
+        return len(set(self.prompt_tokens)) < len(self)
+
     def lengths(self) -> Tensor:
         """(B,) tokens of prompt and response together."""
         return self.mask.sum(1) + self.mask.new_tensor([len(p) for p in self.prompt_tokens], dtype=torch.int64)
 
+    def order(self) -> Tensor:
+        """(B,): rows of one prompt together, which is then run once, and prompts with rows of like length."""
+        lengths, longest = self.lengths().tolist(), dict[tuple[int, ...], int]()
+        for prompt, length in zip(self.prompt_tokens, lengths, strict=True):
+            longest[prompt] = max(length, longest.get(prompt, 0))
+        keys = [(longest[p], p, length) for p, length in zip(self.prompt_tokens, lengths, strict=True)]
+        return torch.tensor(sorted(range(len(keys)), key=keys.__getitem__), device=self.mask.device)
+
     def parts(self, size: int) -> Iterator[tuple[Tensor, Responses]]:
-        """Rows of like length together: (their indices, the rows), so that little padding is computed on."""
-        for at in self.lengths().argsort(stable=True).split(size):  # type: ignore[no-untyped-call]
+        """(Indices, rows) of at most so many at a time, in that order."""
+        for at in self.order().split(size):  # type: ignore[no-untyped-call]
             yield at, self.rows(at)
 
     @classmethod

@@ -27,8 +27,8 @@ class Rows:
         width = int(self.mask[at].sum(1).max())
         return Rows(self.chosen[at, :width], self.mask[at, :width])
 
-    def lengths(self) -> Tensor:
-        return self.mask.sum(1)
+    def order(self) -> Tensor:
+        return self.mask.sum(1).argsort(stable=True)
 
 
 class Table:

@@ -10,7 +10,7 @@ from transformers import GPT2Config, GPT2LMHeadModel, LlamaConfig, LlamaForCausa
 
 from prefrl.policies.decoder import plan
 from prefrl.policies.generate import Generation, Sampling, draw, generate, pad_left
-from prefrl.policies.logprobs import all_logp, response_logp
+from prefrl.policies.logprobs import Shortcuts, all_logp, response_logp
 from prefrl.policies.responses import Responses
 
 V = 50
@@ -210,7 +210,9 @@ def test_scoring_in_chunks_changes_nothing_but_rounding() -> None:
     rows = responses(drawn(model, Sampling(5, 12, ENDS)), 5)
     whole = response_logp(model, rows, 1.0).detach()
     for chunk in (1, 3, 100):
-        torch.testing.assert_close(all_logp(model, rows, 1.0, chunk), whole, atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            all_logp(model, rows, 1.0, chunk, Shortcuts(head_alone=True)), whole, atol=1e-5, rtol=0
+        )
 
 
 def test_each_prompt_is_run_once_for_all_its_samples() -> None:
