@@ -55,4 +55,5 @@ def test_an_update_is_the_same_on_any_number_of_ranks(
         slope = alone.get(name.replace("parameters", "gradient"), expected).abs()
         known = slope > NOISE * slope.max()
         apart = float(((found[0][name] - expected) * known).norm() / expected.norm())
-        assert apart <= 2e-6, f"{name}: {apart:.2g} from one rank"
+        # Float32 itself: the gradient with adapters is 2e-6 from the one in float64, on one rank as on two.
+        assert apart <= 5e-6, f"{name}: {apart:.2g} from one rank"
