@@ -163,7 +163,7 @@ def ours(folder: Path, algorithm: str) -> None:
         encode=lambda prompt: tuple(words.encode(prompt)),
         ends=(),  # a fixed length
         response_tokens=NEW_TOKENS,
-        model=lambda: LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32).eval(),
+        model=lambda frozen=False: LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32).eval(),
         prompts=lambda count, rng: prompts(next(rounds)),
     )
     reward: Any = SimpleNamespace(score=lambda found: np.array([reward_of(list(r.tokens)) for r in found], np.float32))

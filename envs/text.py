@@ -17,6 +17,7 @@ from prefrl.envs.grammar import Grammar
 from prefrl.envs.prompts import is_for_evaluation
 from prefrl.envs.reviews import reviews, source
 from prefrl.policies.cloning import CloningSettings
+from prefrl.policies.pretrained import on_same_weights
 from prefrl.types import Fields, Floats, Response
 
 SHIPPED = Path(__file__).parent / "starts" / "reviews"
@@ -61,9 +62,9 @@ class Reviews:
         self._grammar = grammar
         self._vader = SentimentIntensityAnalyzer()
 
-    def model(self) -> LlamaForCausalLM:
-        """A fresh copy of the cloned model, in float32; it has no dropout."""
-        return copy.deepcopy(self._model)
+    def model(self, frozen: bool = False) -> LlamaForCausalLM:
+        """The cloned model, in float32; it has no dropout."""
+        return on_same_weights(self._model) if frozen else copy.deepcopy(self._model)
 
     def encode(self, prompt: str) -> tuple[int, ...]:
         return tuple(self.tokenizer.encode(prompt))

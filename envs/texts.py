@@ -23,7 +23,7 @@ from transformers import (
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.prompts import Long, Opening, Prompt, check_template, for_evaluation, read_prompts, turn_end
 from prefrl.policies.cloning import make_tokenizer
-from prefrl.policies.pretrained import Precision, context_of, load_tokenizer, load_weights
+from prefrl.policies.pretrained import Precision, context_of, load_tokenizer, load_weights, on_same_weights
 from prefrl.types import Fields, Floats, Response
 
 RESPONSE_TOKENS = 256
@@ -132,8 +132,8 @@ class Texts:
     kind: str = "text"
     notes: tuple[str, ...] = field(default=())
 
-    def model(self) -> PreTrainedModel:
-        return copy.deepcopy(self.start)
+    def model(self, frozen: bool = False) -> PreTrainedModel:
+        return on_same_weights(self.start) if frozen else copy.deepcopy(self.start)
 
     def columns(self, prompt: str) -> Fields:
         return self.known.get(prompt, {})

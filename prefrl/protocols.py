@@ -161,8 +161,9 @@ class TextTask(Task, Protocol):
     def ends(self) -> tuple[int, ...]:
         """The tokens that end a response."""
 
-    def model(self) -> PreTrainedModel:
-        """A fresh copy of the starting policy, with dropout off."""
+    def model(self, frozen: bool = False) -> PreTrainedModel:
+        """The starting policy, with dropout off: a copy of its own, or, `frozen`, on weights that all such models share
+        and that nobody may change."""
 
     def encode(self, prompt: str) -> tuple[int, ...]:
         """The tokens of a prompt that the policy goes on from: with one begin token, or in its chat template."""

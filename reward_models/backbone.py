@@ -141,9 +141,9 @@ def end_token(tokenizer: PreTrainedTokenizerBase) -> int:
     return int(found)
 
 
-def of_policy(task: TextTask, chat: bool) -> Backbone:
+def of_policy(task: TextTask, chat: bool, frozen: bool) -> Backbone:
     """The task's starting policy, reading what was sampled, or the text where it is put into a chat template."""
-    return _ready(task.model().base_model, task.tokenizer, task, "mean", chat)
+    return _ready(task.model(frozen).base_model, task.tokenizer, task, "mean", chat)
 
 
 def of_folder(name: str, task: TextTask, download: bool, pool: Literal["first", "mean"], chat: bool) -> Backbone:

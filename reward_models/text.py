@@ -77,7 +77,7 @@ class TransformerSettings(Settings):
         if self.backbone:
             backbone = of_folder(self.backbone, text(task, NEEDS), self.download, self.pool, bool(self.chat_template))
         else:
-            backbone = of_policy(text(task, NEEDS), bool(self.chat_template))
+            backbone = of_policy(text(task, NEEDS), bool(self.chat_template), frozen=self.train != "full")
         return TransformerReward(self, backbone, rng)
 
 

@@ -52,11 +52,11 @@ class LanguagePolicy:
         self, task: TextTask, temperature: float, settings: LanguageSettings, rng: np.random.Generator
     ) -> None:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
-        self.model = task.model()
+        self.model = task.model(frozen=settings.train == "lora")
         self._shortcuts = shortcuts_of(self.model)
         check_exact(self.model, self._probe)
         if settings.train == "full":
-            self.start = task.model().requires_grad_(False)  # a second copy of the weights
+            self.start = task.model(frozen=True)
             return
         from prefrl.policies.lora import add_adapters  # peft takes seconds to load
 

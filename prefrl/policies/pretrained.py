@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import torch
 from transformers import AutoModel, AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase
@@ -20,6 +21,7 @@ from transformers.utils.logging import (
 
 from prefrl.components import ConfigError
 
+M = TypeVar("M", bound=PreTrainedModel)
 Precision: TypeAlias = Literal["float32", "bfloat16"]
 
 
@@ -71,6 +73,13 @@ def _where(name: str | Path, download: bool) -> dict[str, Any]:
     if path.suffix == ".gguf" and path.is_file():
         return {"pretrained_model_name_or_path": path.parent, "gguf_file": path.name, **safe}
     return {"pretrained_model_name_or_path": name, **safe}
+
+
+def on_same_weights(model: M) -> M:
+    """Another model on the very same weights, which it does not train."""
+    # What the copy is told to have copied already; tied weights stay tied.
+    known = {id(p): torch.nn.Parameter(p.detach(), requires_grad=False) for p in model.parameters()}
+    return copy.deepcopy(model, known)
 
 
 def context_of(model: PreTrainedModel) -> int | None:

@@ -90,6 +90,16 @@ def test_each_model_is_a_fresh_copy_without_dropout(toy_reviews: Reviews) -> Non
     assert second.config.attention_dropout == 0.0
 
 
+def test_frozen_models_have_their_weights_in_common_and_nothing_else(toy_reviews: Reviews) -> None:
+    first, second = toy_reviews.model(frozen=True), toy_reviews.model(frozen=True)
+    pairs = list(zip(first.parameters(), second.parameters(), strict=True))
+    assert all(a is not b and a.data_ptr() == b.data_ptr() for a, b in pairs)
+    assert not any(p.requires_grad for p in first.parameters())
+    assert first.get_output_embeddings().weight is first.get_input_embeddings().weight  # type: ignore[no-untyped-call]
+    first.lm_head = torch.nn.Identity()
+    assert isinstance(second.lm_head, torch.nn.Linear)
+
+
 def test_the_model_learns_what_follows_what(toy_reviews: Reviews, rng: np.random.Generator) -> None:
     tokenizer, losses = toy_reviews.tokenizer, []
     for prompt, rest in (REVIEWS.sample(rng) for _ in range(50)):

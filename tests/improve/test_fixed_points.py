@@ -57,7 +57,7 @@ class Six:
     ends: tuple[int, ...] = (END,)
     tokenizer: Any = field(default_factory=_Words)
 
-    def model(self) -> LlamaForCausalLM:
+    def model(self, frozen: bool = False) -> LlamaForCausalLM:
         return copy.deepcopy(self.start)
 
     def encode(self, prompt: str) -> tuple[int, ...]:

@@ -139,7 +139,7 @@ def test_a_policy_of_half_precision_learns_with_adapters_of_full(toy_reviews: Re
         def __getattr__(self, name: str) -> Any:
             return getattr(toy_reviews, name)
 
-        def model(self) -> Any:
+        def model(self, frozen: bool = False) -> Any:
             return toy_reviews.model().to(torch.bfloat16)  # type: ignore[arg-type]
 
     one = TextLearnerSettings(policy=LanguageSettings(train="lora"), updates=1, prompts=4, responses=4).build(
