@@ -117,6 +117,7 @@ class FastDecoder:
         """`cache` and `mask` (P, T): of left-padded prompts, each to be continued `samples` times by `room` steps."""
         self._plan = plan
         self._cache = [_roomy(layer, samples, room) for layer in cache.layers]
+        self._room = room
         self._at = mask.shape[1]  # the column that is written next, the same for all rows
         self._positions = mask.sum(1).repeat_interleave(samples)  # (B,): each row's own, padding not counted
         self._bias = _bias(mask, plan.groups, samples, room, plan.embedding.dtype)
@@ -151,6 +152,30 @@ class FastDecoder:
         flat = (rows[:, None] * groups + torch.arange(groups, device=rows.device)).flatten()
         self._cache = [(keys[flat], values[flat]) for keys, values in self._cache]
         self._bias = self._bias[flat]
+
+    joins = True
+
+    def join(self, other: FastDecoder) -> None:
+        positions = torch.cat([self._positions, other._positions])
+        longest, room = int(positions.max()), max(self._room, other._room)
+
+        def behind(mine: Tensor, others: Tensor) -> Tensor:
+            """(., T, D) columns that are written, the last `longest` of both, and room."""
+            out = mine.new_zeros(len(mine) + len(others), longest + room, mine.shape[2])
+            written = [right(x[:, :end], longest, 1) for x, end in ((mine, self._at), (others, other._at))]
+            torch.cat(written, out=out[:, :longest])
+            return out
+
+        layers = zip(self._cache, other._cache, strict=True)
+        self._cache = [(behind(k, new_k), behind(v, new_v)) for (k, v), (new_k, new_v) in layers]
+        # Rows end at the same column, and each has as many real ones as tokens.
+        padding = torch.arange(longest + room, device=positions.device) < longest - positions[:, None]
+        bias = torch.zeros(padding.shape, dtype=self._bias.dtype, device=positions.device)
+        bias = bias.masked_fill_(padding, float("-inf"))
+        self._bias = bias.repeat_interleave(self._plan.groups, 0)[:, None]
+        self._at, self._positions, self._room = longest, positions, room
+        if self._plan.rotary is not None and len(other._cos) > len(self._cos):
+            self._cos, self._sin = other._cos, other._sin
 
     def _normed(self, x: Tensor) -> Tensor:
         """Without weight and bias, which are part of the matrix that follows."""
@@ -212,6 +237,15 @@ def _roomy(layer: Module, samples: int, room: int) -> tuple[Tensor, Tensor]:
         out[:, :, :, :width] = x[:, None]  # (P, 1, G, T, D), broadcast over samples
         found.append(out.view(-1, width + room, size))
     return found[0], found[1]
+
+
+def right(x: Tensor, width: int, dim: int) -> Tensor:
+    """Its last `width` columns along a dimension, padded with 0 on the left where there are fewer."""
+    have = x.shape[dim]
+    if have >= width:
+        return x.narrow(dim, have - width, width)
+    missing = x.new_zeros(*x.shape[:dim], width - have, *x.shape[dim + 1 :])
+    return torch.cat([missing, x], dim)
 
 
 def _bias(mask: Tensor, groups: int, samples: int, room: int, dtype: torch.dtype) -> Tensor:

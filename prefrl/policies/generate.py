@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
 from transformers import DynamicCache, PreTrainedModel
+from transformers.cache_utils import DynamicLayer
 
 from prefrl.distributed import world
-from prefrl.policies.decoder import FastDecoder, plan
+from prefrl.policies.decoder import FastDecoder, plan, right
 
 KEEP_SHARE = 0.75
 """Ended rows are dropped once this share or less of the rows goes on: moving the cache costs more than a few rows."""
@@ -62,6 +63,13 @@ class Decoder(Protocol):
     def keep(self, rows: Tensor) -> None:
         """Go on with these rows only."""
 
+    @property
+    def joins(self) -> bool:
+        """Whether it can take in others of its kind."""
+
+    def join(self, other: Self) -> None:
+        """Go on with the rows of another one as well, behind these."""
+
 
 class CacheDecoder:
     """Any causal model, through transformers' own cache."""
@@ -90,6 +98,19 @@ class CacheDecoder:
         self._cache.batch_select_indices(rows)
         self._mask, self._positions = self._mask[rows], self._positions[rows]
 
+    @property
+    def joins(self) -> bool:
+        return all(type(layer) is DynamicLayer for layer in self._cache.layers)  # others keep a window, or a state
+
+    def join(self, other: CacheDecoder) -> None:
+        longest = int(torch.cat([self._mask.sum(1), other._mask.sum(1)]).max())
+        layers: Any = zip(self._cache.layers, other._cache.layers, strict=True)  # of keys and values (B, G, T, D)
+        for mine, others in layers:
+            mine.keys = torch.cat([right(x.keys, longest, 2) for x in (mine, others)])
+            mine.values = torch.cat([right(x.values, longest, 2) for x in (mine, others)])
+        self._mask = torch.cat([right(x, longest, 1) for x in (self._mask, other._mask)])
+        self._positions = torch.cat([self._positions, other._positions])
+
 
 @torch.no_grad()
 def generate(
@@ -98,10 +119,12 @@ def generate(
     sampling: Sampling,
     generator: torch.Generator,
     fast: bool = True,
+    at_once: int | None = None,
 ) -> Generation:
     """Draw K responses to each of P prompts (token ids). Raises `ValueError` while the model is in training mode.
 
-    `fast` allows the decoder that is written out, which agrees with the general one to rounding.
+    `fast` allows the decoder that is written out, which agrees with the general one to rounding. `at_once`: the most
+    rows in a batch, but for the K of one prompt; where rows end, those of the next prompts take their places.
     """
     if model.training:
         raise ValueError("generation wants the model in eval mode: dropout would falsify its log-probabilities")
@@ -111,8 +134,7 @@ def generate(
     uniform = torch.rand(shape, generator=generator)[world().mine].flatten(0, 1).to(model.device)
     mine = prompts[world().mine]
     if mine or world().size == 1:
-        decoder, logits = _prefill(model, mine, sampling, fast)
-        drawn = _decode(decoder, logits, sampling, uniform)
+        drawn = _decode(_Opener(model, mine, sampling, fast), uniform, at_once)
     else:
         drawn = _nothing(uniform)
     if world().size == 1:
@@ -132,28 +154,62 @@ def pad_left(prompts: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     return ids, mask
 
 
-def _prefill(
-    model: PreTrainedModel, prompts: Sequence[Sequence[int]], sampling: Sampling, fast: bool
-) -> tuple[Decoder, Tensor]:
-    """Run each prompt once; (B, V) logits of the first tokens."""
-    ids, mask = pad_left(prompts)
-    ids, mask = ids.to(model.device), mask.to(model.device)
-    cache = DynamicCache(config=model.config)
-    # Padding is not counted: a model with absolute positions would otherwise see every prompt shifted.
-    positions = (mask.cumsum(1) - 1).clamp(min=0)
-    out = model(
-        input_ids=ids,
-        attention_mask=mask,
-        position_ids=positions,
-        past_key_values=cache,
-        use_cache=True,
-        logits_to_keep=1,
-    )
-    logits = out.logits[:, -1].repeat_interleave(sampling.samples, 0)  # (P, V) -> (B, V)
-    planned = plan(model, mask.shape[1] + sampling.max_tokens) if fast else None
-    if planned is not None:
-        return FastDecoder(planned, cache, mask, sampling.samples, sampling.max_tokens), logits
-    return CacheDecoder(model, cache, mask, sampling.samples), logits
+@dataclass
+class _Going:
+    """Rows that are being written."""
+
+    decoder: Decoder
+    logits: Tensor
+    """(b, V) of the next tokens."""
+    rows: Tensor
+    """(b,): which of the B responses they are."""
+    at: Tensor
+    """(b,): how many tokens each has."""
+
+
+class _Opener:
+    """Runs prompts, each once for its samples."""
+
+    def __init__(
+        self, model: PreTrainedModel, prompts: Sequence[Sequence[int]], sampling: Sampling, fast: bool
+    ) -> None:
+        self._model, self._prompts, self.sampling = model, prompts, sampling
+        longest = max(map(len, prompts), default=0)
+        self._plan = plan(model, longest + sampling.max_tokens) if fast else None
+        self._next = 0
+
+    @property
+    def waiting(self) -> int:
+        """Prompts that were not run yet."""
+        return len(self._prompts) - self._next
+
+    def open(self, count: int) -> _Going:
+        """Run the next so many prompts."""
+        first, self._next = self._next, self._next + count
+        decoder, logits = self._prefill(self._prompts[first : first + count])
+        rows = torch.arange(first * self.sampling.samples, self._next * self.sampling.samples, device=logits.device)
+        return _Going(decoder, logits, rows, torch.zeros_like(rows))
+
+    def _prefill(self, prompts: Sequence[Sequence[int]]) -> tuple[Decoder, Tensor]:
+        """A decoder, and (b, V) logits of the first tokens."""
+        model, samples = self._model, self.sampling.samples
+        ids, mask = pad_left(prompts)
+        ids, mask = ids.to(model.device), mask.to(model.device)
+        cache = DynamicCache(config=model.config)
+        # Padding is not counted: a model with absolute positions would otherwise see every prompt shifted.
+        positions = (mask.cumsum(1) - 1).clamp(min=0)
+        out = model(
+            input_ids=ids,
+            attention_mask=mask,
+            position_ids=positions,
+            past_key_values=cache,
+            use_cache=True,
+            logits_to_keep=1,
+        )
+        logits = out.logits[:, -1].repeat_interleave(samples, 0)  # (P, V) -> (b, V)
+        if self._plan is not None:
+            return FastDecoder(self._plan, cache, mask, samples, self.sampling.max_tokens), logits
+        return CacheDecoder(model, cache, mask, samples), logits
 
 
 def _nothing(uniform: Tensor) -> Generation:
@@ -162,28 +218,52 @@ def _nothing(uniform: Tensor) -> Generation:
     return Generation(logp.long(), logp.bool(), logp, logp[:, 0].bool())
 
 
-def _decode(decoder: Decoder, logits: Tensor, sampling: Sampling, uniform: Tensor) -> Generation:
-    """(B, V) logits of the first tokens, and a number in [0, 1) for each of the (B, L) places."""
-    rows, length = uniform.shape
-    drawn_so_far = _nothing(uniform)
-    tokens, mask, logp, ended = (getattr(drawn_so_far, one.name) for one in fields(Generation))
-    ends = torch.tensor(sampling.ends, dtype=torch.int64, device=logits.device)
-    live = torch.arange(rows, device=logits.device)
-    for t in range(length):
-        drawn, drawn_logp = draw(_narrowed(logits, sampling), uniform[live, t], sampling.temperature or 1.0)
-        going = ~ended[live]  # ended rows that are still in the batch draw on, into padding
-        tokens[live, t], logp[live, t], mask[live, t] = drawn * going, drawn_logp * going, going
-        # Only after the mask was written: an end token is a real one.
-        ended[live] |= torch.isin(drawn, ends)
-        going = ~ended[live]
-        if t + 1 == length or not going.any():
-            break
-        if going.float().mean() <= KEEP_SHARE:
-            kept = going.nonzero()[:, 0]
-            decoder.keep(kept)
-            live, drawn = live[kept], drawn[kept]  # `kept` counts within the batch, `live` within the result
-        logits = decoder.step(drawn)
-    return Generation(tokens, mask, logp, ended)
+def _decode(opener: _Opener, uniform: Tensor, at_once: int | None) -> Generation:
+    """With a number in [0, 1) for each of the (B, L) places."""
+    found, samples = _nothing(uniform), opener.sampling.samples
+    most = opener.waiting if at_once is None else max(1, at_once // samples)  # prompts
+    going = opener.open(min(most, opener.waiting))
+    while True:
+        drawn, on = _draw_next(going, opener.sampling, uniform, found)
+        left = int(on.sum())
+        place = (most * samples - left) // samples  # for so many prompts
+        if not left and not opener.waiting:
+            return found
+        refill = place >= (1 - KEEP_SHARE) * most and (not left or going.decoder.joins)
+        more = opener.open(min(place, opener.waiting)) if refill and opener.waiting else None
+        if not left:
+            going = more or opener.open(min(most, opener.waiting))
+            continue
+        if left <= KEEP_SHARE * len(on) or more:
+            kept = on.nonzero()[:, 0]
+            going.decoder.keep(kept)
+            going.rows, going.at, drawn = going.rows[kept], going.at[kept], drawn[kept]
+        going.logits = going.decoder.step(drawn)
+        if more:
+            going = _joined(going, more)
+
+
+def _draw_next(going: _Going, sampling: Sampling, uniform: Tensor, found: Generation) -> tuple[Tensor, Tensor]:
+    """Write a token of each row down; (b,) the tokens, and (b,) bool: the rows that go on."""
+    rows, at = going.rows, going.at.clamp(max=uniform.shape[1] - 1)
+    drawn, drawn_logp = draw(_narrowed(going.logits, sampling), uniform[rows, at], sampling.temperature or 1.0)
+    open_ = ~found.ended[rows] & (going.at < uniform.shape[1])  # others are still in the batch, and draw for nobody
+    rows, at, said = rows[open_], at[open_], drawn[open_]
+    found.tokens[rows, at], found.logp[rows, at], found.mask[rows, at] = said, drawn_logp[open_], True
+    # Only after the mask was written: an end token is a real one.
+    found.ended[rows] = torch.isin(said, torch.tensor(sampling.ends, dtype=torch.int64, device=said.device))
+    going.at = going.at + 1
+    return drawn, ~found.ended[going.rows] & (going.at < uniform.shape[1])
+
+
+def _joined(one: _Going, other: _Going) -> _Going:
+    one.decoder.join(other.decoder)
+    return _Going(
+        one.decoder,
+        torch.cat([one.logits, other.logits]),
+        torch.cat([one.rows, other.rows]),
+        torch.cat([one.at, other.at]),
+    )
 
 
 def _narrowed(logits: Tensor, sampling: Sampling) -> Tensor:

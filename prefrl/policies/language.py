@@ -37,6 +37,9 @@ class LanguageSettings(Settings):
     """Which matrices get an adapter: all of them, or those that peft knows as usual for the architecture."""
     chunk: int = Field(64, ge=2)
     """Responses in one pass of a network while learning: changes memory and speed, and nothing else but rounding."""
+    at_once: int = Field(256, ge=1)
+    """Responses that are written at the same time, or all of one prompt's: where some end, others are begun. Changes
+    memory and speed, and nothing else but rounding."""
 
 
 class LanguagePolicy:
@@ -52,6 +55,7 @@ class LanguagePolicy:
         self, task: TextTask, temperature: float, settings: LanguageSettings, rng: np.random.Generator
     ) -> None:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
+        self._at_once = settings.at_once
         self.model = task.model(frozen=settings.train == "lora")
         self._shortcuts = shortcuts_of(self.model)
         check_exact(self.model, self._probe)
@@ -90,7 +94,7 @@ class LanguagePolicy:
         """
         encoded = [self.opened(prompt) for prompt in prompts]
         sampling = sampling or self.sampling(samples)
-        drawn = generate(self.model, encoded, sampling, generator(rng))
+        drawn = generate(self.model, encoded, sampling, generator(rng), at_once=self._at_once)
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)

@@ -8,7 +8,7 @@ from families import tiny
 from torch import Tensor
 from transformers import GPT2Config, GPT2LMHeadModel, LlamaConfig, LlamaForCausalLM, PreTrainedModel
 
-from prefrl.policies.decoder import plan
+from prefrl.policies.decoder import FastDecoder, plan
 from prefrl.policies.generate import Generation, Sampling, draw, generate, pad_left
 from prefrl.policies.logprobs import Shortcuts, all_logp, response_logp
 from prefrl.policies.responses import Responses
@@ -50,6 +50,39 @@ def _loud(model: PreTrainedModel) -> PreTrainedModel:
 
 def drawn(model: PreTrainedModel, sampling: Sampling, fast: bool = True, seed: int = 0) -> Generation:
     return generate(model, PROMPTS, sampling, torch.Generator().manual_seed(seed), fast)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("name", ["llama", "gpt2", "qwen3", "phi"])
+def test_rows_that_end_make_room_for_others_and_nothing_else_changes(name: str, fast: bool) -> None:
+    model = family(name)
+    order = torch.Generator().manual_seed(3)
+    prompts = [torch.randint(3, V, (n,), generator=order).tolist() for n in (3, 1, 9, 2, 5, 1, 7, 4, 2, 11)]
+    sampling, made = Sampling(2, 14, ENDS), torch.Generator
+    whole = generate(model, prompts, sampling, made().manual_seed(5), fast)
+    assert 0 < int(whole.ended.sum()) < len(whole.ended)
+    for at_once in (1, 4, 7, 12):
+        found = generate(model, prompts, sampling, made().manual_seed(5), fast, at_once)
+        assert torch.equal(found.tokens, whole.tokens)
+        assert torch.equal(found.mask, whole.mask)
+        assert torch.equal(found.ended, whole.ended)
+        torch.testing.assert_close(found.logp, whole.logp, atol=2e-5, rtol=0)
+
+
+def test_no_more_rows_than_are_allowed_are_written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, seen = family("llama"), list[int]()
+    step = FastDecoder.step
+
+    def counting(self: FastDecoder, tokens: Tensor) -> Tensor:
+        seen.append(len(tokens))
+        return step(self, tokens)
+
+    monkeypatch.setattr(FastDecoder, "step", counting)
+    prompts = [[3 + i] * (i % 5 + 1) for i in range(40)]
+    generate(model, prompts, Sampling(2, 14, ENDS), torch.Generator().manual_seed(5), at_once=10)
+    assert max(seen) <= 10
+    assert len(seen) < 8 * 13  # eight blocks, one after the other, each as long as its longest row
+    assert sum(seen[:20]) > 0.6 * 10 * 20
 
 
 def responses(found: Generation, samples: int, prompts: Sequence[Sequence[int]] = PROMPTS) -> Responses:
