@@ -6,8 +6,8 @@ It knows the shapes of Llama, Mistral, Qwen, Phi, GPT-2 and GPT-NeoX, in float32
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import torch
@@ -45,16 +45,6 @@ class Affine:
             return linear(x, self.weight, self.bias)
         return torch.addmm(beside if self.bias is None else beside + self.bias, x, self.weight.T)
 
-    def laid_out(self) -> Affine:
-        """The same, its matrix in memory as (in, out): a product with few rows is a sixth faster so."""
-        return Affine(self.weight.T.contiguous().T, self.bias)
-
-    def after(self, norm: Module) -> Affine:
-        """The same on what a norm gives before its own weight n and bias c: W (n x + c) + b = (W n) x + (W c + b)."""
-        shift = getattr(norm, "bias", None)  # an RMS norm has none
-        bias = self.bias if shift is None else self.weight @ shift + (0.0 if self.bias is None else self.bias)
-        return Affine(self.weight * norm.weight, bias)
-
 
 @dataclass(frozen=True)
 class Layer:
@@ -69,10 +59,6 @@ class Layer:
     head_norms: tuple[Tensor, Tensor] | None = None
     """Weights of norms over each query, scaled, and each key."""
 
-    def laid_out(self) -> Layer:
-        qkv, out, up, down = (one.laid_out() for one in (self.qkv, self.out, self.up, self.down))
-        return Layer(qkv, out, up, down, self.head_norms)
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -85,6 +71,8 @@ class Plan:
     act: Callable[[Tensor], Tensor]
     layers: tuple[Layer, ...]
     embedding: Tensor
+    norm: Module
+    """Before the head, which is too large to be multiplied with its weight."""
     head: Affine
     rms: bool = False
     """Norms divide by the root mean square; else they centre as well."""
@@ -96,6 +84,7 @@ class Plan:
     rotary: Module = None
 
 
+@torch.no_grad()
 def plan(model: PreTrainedModel, length: int) -> Plan | None:
     """How a model decodes within `length` tokens; None where that is not written out here."""
     make = PLANS.get(type(model))  # a subclass may compute something else
@@ -106,8 +95,7 @@ def plan(model: PreTrainedModel, length: int) -> Plan | None:
     window = window_of(model)
     if rope.get("rope_type", "default") != "default" or (window is not None and length > window):
         return None
-    found = make(model)
-    return found and replace(found, layers=tuple(layer.laid_out() for layer in found.layers))
+    return make(model)
 
 
 class FastDecoder:
@@ -143,7 +131,7 @@ class FastDecoder:
             x = self._perceptron(layer, normed if plan.parallel else self._normed(x), x)
         self._at += 1
         self._positions = self._positions + 1
-        return plan.head(self._normed(x))
+        return plan.head(plan.norm(x))
 
     def keep(self, rows: Tensor) -> None:
         self._positions = self._positions[rows]
@@ -267,11 +255,25 @@ def affine(layer: Module) -> Affine:
     return Affine(weight if isinstance(base, torch.nn.Linear) else weight.T, base.bias)
 
 
-def fused(*parts: Affine) -> Affine:
-    """Several maps of one input, one below the other."""
-    biases = [torch.zeros(len(p.weight), device=p.weight.device) if p.bias is None else p.bias for p in parts]
-    bias = None if all(part.bias is None for part in parts) else torch.cat(biases)
-    return Affine(torch.cat([part.weight for part in parts]), bias)
+def fused(*parts: Affine, after: Module = None) -> Affine:
+    """Several maps of one input, one below the other.
+
+    `after` a norm they take what it gives before its own weight n and bias c: W (n x + c) + b = (W n) x + (W c + b).
+    """
+    sizes, width = [len(part.weight) for part in parts], parts[0].weight.shape[1]
+    # In memory as (in, out): a product with few rows is a sixth faster so.
+    matrix = parts[0].weight.new_empty(width, sum(sizes))
+    for part, columns in zip(parts, matrix.split(sizes, 1), strict=True):  # type: ignore[no-untyped-call]
+        torch.mul(part.weight.T, 1.0 if after is None else after.weight[:, None], out=columns)
+    shift = None if after is None else getattr(after, "bias", None)  # an RMS norm has none
+    return Affine(matrix.T, _fused_bias(parts, shift))
+
+
+def _fused_bias(parts: Sequence[Affine], shift: Tensor | None) -> Tensor | None:
+    if shift is None and all(part.bias is None for part in parts):
+        return None
+    biases = [part.weight.new_zeros(len(part.weight)) if part.bias is None else part.bias for part in parts]
+    return torch.cat([b if shift is None else part.weight @ shift + b for part, b in zip(parts, biases, strict=True)])
 
 
 def scaled(part: Affine, by: float) -> Affine:
@@ -290,7 +292,8 @@ def _llama(model: Module) -> Plan:
         act=inner.layers[0].mlp.act_fn,
         layers=tuple(_llama_layer(layer) for layer in inner.layers),
         embedding=inner.embed_tokens.weight,
-        head=affine(model.lm_head).after(inner.norm),
+        norm=inner.norm,
+        head=affine(model.lm_head),
         rotary=inner.rotary_emb,
     )
 
@@ -300,9 +303,9 @@ def _llama_layer(layer: Module) -> Layer:
     norms = (attention.q_norm.weight * attention.scaling, attention.k_norm.weight) if _norms_heads(attention) else None
     q = affine(attention.q_proj)
     q = q if norms else scaled(q, attention.scaling)  # a norm would undo it
-    qkv = fused(q, affine(attention.k_proj), affine(attention.v_proj)).after(layer.input_layernorm)
-    up = fused(affine(mlp.gate_proj), affine(mlp.up_proj)).after(layer.post_attention_layernorm)
-    return Layer(qkv, affine(attention.o_proj), up, affine(mlp.down_proj), norms)
+    qkv = fused(q, affine(attention.k_proj), affine(attention.v_proj), after=layer.input_layernorm)
+    up = fused(affine(mlp.gate_proj), affine(mlp.up_proj), after=layer.post_attention_layernorm)
+    return Layer(qkv, fused(affine(attention.o_proj)), up, fused(affine(mlp.down_proj)), norms)
 
 
 def _norms_heads(attention: torch.nn.Module) -> bool:
@@ -321,7 +324,8 @@ def _phi(model: Module) -> Plan | None:
         act=inner.layers[0].mlp.activation_fn,
         layers=tuple(_phi_layer(layer) for layer in inner.layers),
         embedding=inner.embed_tokens.weight,
-        head=affine(model.lm_head).after(inner.final_layernorm),
+        norm=inner.final_layernorm,
+        head=affine(model.lm_head),
         rotary=inner.rotary_emb,
     )
 
@@ -329,8 +333,8 @@ def _phi(model: Module) -> Plan | None:
 def _phi_layer(layer: Module) -> Layer:
     attention, norm = layer.self_attn, layer.input_layernorm
     q, k, v = (affine(attention.get_submodule(name)) for name in ("q_proj", "k_proj", "v_proj"))
-    qkv = fused(scaled(q, attention.scaling), k, v).after(norm)
-    return Layer(qkv, affine(attention.dense), affine(layer.mlp.fc1).after(norm), affine(layer.mlp.fc2))
+    qkv, up = fused(scaled(q, attention.scaling), k, v, after=norm), fused(affine(layer.mlp.fc1), after=norm)
+    return Layer(qkv, fused(affine(attention.dense)), up, fused(affine(layer.mlp.fc2)))
 
 
 def _gpt_neox(model: Module) -> Plan:
@@ -343,7 +347,8 @@ def _gpt_neox(model: Module) -> Plan:
         act=inner.layers[0].mlp.act,
         layers=tuple(_gpt_neox_layer(layer, config.num_attention_heads) for layer in inner.layers),
         embedding=inner.embed_in.weight,
-        head=affine(model.get_output_embeddings()).after(inner.final_layer_norm),
+        norm=inner.final_layer_norm,
+        head=affine(model.get_output_embeddings()),
         rotary=inner.rotary_emb,
     )
 
@@ -353,9 +358,9 @@ def _gpt_neox_layer(layer: Module, heads: int) -> Layer:
     # (heads x 3 x D, d): each head's query, key and value stand together -> all queries, all keys, all values.
     weight = whole.weight.view(heads, 3, -1, whole.weight.shape[1]).transpose(0, 1).flatten(0, 2)
     bias = None if whole.bias is None else whole.bias.view(heads, 3, -1).transpose(0, 1).flatten()
-    qkv = _scaled_queries(Affine(weight, bias), attention.scaling).after(layer.input_layernorm)
-    up = affine(layer.mlp.dense_h_to_4h).after(layer.post_attention_layernorm)
-    return Layer(qkv, affine(attention.dense), up, affine(layer.mlp.dense_4h_to_h))
+    qkv = fused(_scaled_queries(Affine(weight, bias), attention.scaling), after=layer.input_layernorm)
+    up = fused(affine(layer.mlp.dense_h_to_4h), after=layer.post_attention_layernorm)
+    return Layer(qkv, fused(affine(attention.dense)), up, fused(affine(layer.mlp.dense_4h_to_h)))
 
 
 def _gpt2(model: Module) -> Plan | None:
@@ -369,14 +374,16 @@ def _gpt2(model: Module) -> Plan | None:
         act=inner.h[0].mlp.act,
         layers=tuple(_gpt2_layer(layer) for layer in inner.h),
         embedding=inner.wte.weight,
-        head=affine(model.lm_head).after(inner.ln_f),
+        norm=inner.ln_f,
+        head=affine(model.lm_head),
         places=inner.wpe.weight,
     )
 
 
 def _gpt2_layer(layer: Module) -> Layer:
-    qkv = _scaled_queries(affine(layer.attn.c_attn), layer.attn.scaling).after(layer.ln_1)
-    return Layer(qkv, affine(layer.attn.c_proj), affine(layer.mlp.c_fc).after(layer.ln_2), affine(layer.mlp.c_proj))
+    qkv = fused(_scaled_queries(affine(layer.attn.c_attn), layer.attn.scaling), after=layer.ln_1)
+    up = fused(affine(layer.mlp.c_fc), after=layer.ln_2)
+    return Layer(qkv, fused(affine(layer.attn.c_proj)), up, fused(affine(layer.mlp.c_proj)))
 
 
 def _scaled_queries(qkv: Affine, by: float) -> Affine:
