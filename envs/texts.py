@@ -41,8 +41,9 @@ class TextsSettings(Settings):
     evaluation_prompts: Path | None = None
     """Prompts to evaluate on; without them one in eight of the others is kept for it."""
     model: Path | None = None
-    """A folder with a causal model of transformers and its tokenizer, or a .gguf file; without one a small Llama over
-    bytes is made whose weights are random: it knows no language, and is a floor to compare with."""
+    """A folder with a causal model of transformers and its tokenizer, or with an adapter of peft's, or a .gguf file;
+    without one a small Llama over bytes is made whose weights are random: it knows no language, and is a floor to
+    compare with."""
     dtype: Precision = "float32"
     """Of the model's weights."""
     chat_template: bool | None = None
@@ -229,6 +230,10 @@ def _load(path: Path, dtype: Precision) -> tuple[PreTrainedModel, PreTrainedToke
     if not path.is_dir() and not (path.is_file() and path.suffix == ".gguf"):
         raise ConfigError(f"task.model: {path} is no folder; expected one that save_pretrained wrote, or a .gguf file")
     try:
+        if (path / "adapter_config.json").exists():
+            from prefrl.policies.lora import load_merged  # peft takes seconds to load
+
+            return load_merged(path, dtype)
         model = load_weights(AutoModelForCausalLM, path, False, dtype=dtype)
         return model, load_tokenizer(path, False)
     except ConfigError as error:

@@ -319,7 +319,7 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         sys.exit(130)
-    except (ValueError, FloatingPointError, ModuleNotFoundError, OSError) as error:
+    except (ValueError, FloatingPointError, MemoryError, ModuleNotFoundError, OSError) as error:
         if os.environ.get("PREFRL_DEBUG"):
             raise
         from prefrl.cli.console import errors

@@ -35,7 +35,7 @@ from prefrl.improve.objectives import (
     step_rewards,
 )
 from prefrl.improve.writer import Writer
-from prefrl.policies.language import LanguageSettings
+from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
 from prefrl.seeding import Device, generator
@@ -235,7 +235,8 @@ class TextLearner:
         advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
         batch = Batch(drawn, drawn.logp, advantages.view(-1, 1))  # (B, 1): the same for all tokens
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
-        steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
+        with enough_memory("learner.policy.chunk", settings.policy.chunk):
+            steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
         self._check_ratio(steps[0]["ratio_error"])
         # Per response, as the target is: a mean per token would be smaller by the length.
         sequence_kl = float(kl.sum(1).mean())

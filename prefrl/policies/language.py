@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -40,6 +40,19 @@ class LanguageSettings(Settings):
     at_once: int = Field(256, ge=1)
     """Responses that are written at the same time, or all of one prompt's: where some end, others are begun. Changes
     memory and speed, and nothing else but rounding."""
+
+
+@contextmanager
+def enough_memory(setting: str, value: int) -> Iterator[None]:
+    """Say which setting halves what is needed: MemoryError takes the place of what torch raises."""
+    try:
+        yield
+    except RuntimeError as error:  # torch.OutOfMemoryError, of GPUs, is one
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate memory" not in str(error):
+            raise
+        raise MemoryError(
+            f"memory ran out: halve {setting}, which is {value}; learner.policy.train=lora needs less throughout"
+        ) from error
 
 
 class LanguagePolicy:
@@ -80,7 +93,8 @@ class LanguagePolicy:
         return list(self._trained().values())
 
     def log_prob(self, inputs: Responses) -> tuple[Tensor, None]:
-        return response_logp(self.model, inputs, self.temperature, self._shortcuts), None
+        with enough_memory("learner.policy.chunk", self.part):
+            return response_logp(self.model, inputs, self.temperature, self._shortcuts), None
 
     def values(self, inputs: Responses) -> Tensor:
         raise ValueError("a language model without a critic has no values: set the weight of the critic's loss to 0")
@@ -94,7 +108,8 @@ class LanguagePolicy:
         """
         encoded = [self.opened(prompt) for prompt in prompts]
         sampling = sampling or self.sampling(samples)
-        drawn = generate(self.model, encoded, sampling, generator(rng), at_once=self._at_once)
+        with enough_memory("learner.policy.at_once", self._at_once):
+            drawn = generate(self.model, encoded, sampling, generator(rng), at_once=self._at_once)
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
@@ -115,7 +130,7 @@ class LanguagePolicy:
         """(B, L) log-probabilities under the starting policy, without gradients."""
         self._check_room(int(responses.lengths().max()))
         temperature = self.temperature if temperature is None else temperature
-        with self._at_the_start():
+        with self._at_the_start(), enough_memory("learner.policy.chunk", self.part):
             return all_logp(self.start, responses, temperature, self.part, self._shortcuts)
 
     @torch.no_grad()

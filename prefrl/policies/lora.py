@@ -10,16 +10,18 @@ import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from peft import LoraConfig, inject_adapter_in_model
+from peft import LoraConfig, PeftConfig, PeftModel, inject_adapter_in_model
 from peft.tuners.tuners_utils import BaseTunerLayer
 from safetensors.numpy import save_file
-from transformers import PreTrainedModel
+from transformers import AutoModelForCausalLM, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.pytorch_utils import Conv1D
 
 from prefrl.components import ConfigError
+from prefrl.policies.pretrained import Precision, load_tokenizer, load_weights
 from prefrl.seeding import draw_seed, to_numpy
 
 
@@ -75,6 +77,7 @@ def save_adapters(model: PreTrainedModel, folder: Path) -> None:
     layers = {n: m for n, m in model.named_modules() if isinstance(m, BaseTunerLayer)}
     rank = next(len(p) for name, p in found.items() if "lora_A" in name)
     base = model.config._name_or_path or None
+    base = str(Path(base).resolve()) if base and Path(base).exists() else base  # wherever it is loaded from later
     config = LoraConfig(
         r=rank,
         lora_alpha=2 * rank,
@@ -88,6 +91,30 @@ def save_adapters(model: PreTrainedModel, folder: Path) -> None:
     config.save_pretrained(str(folder))
     named = {f"base_model.model.{name.replace('.default.', '.')}": p for name, p in found.items()}
     save_file(named, folder / "adapter_model.safetensors", {"format": "pt"})
+
+
+def load_merged(folder: Path, dtype: Precision) -> tuple[PreTrainedModel, PreTrainedTokenizerBase]:
+    """The model that an adapter was trained on, the adapter added to its matrices, and a tokenizer.
+
+    What is learned from there on gets adapters of its own, so that the reference is the model with the first ones.
+    Raises `ConfigError` where the model is not on this machine.
+    """
+    settings = PeftConfig.from_pretrained(str(folder))
+    base = Path(settings.base_model_name_or_path or "")
+    if not settings.base_model_name_or_path or not base.exists():
+        raise ConfigError(
+            f"{folder} is an adapter of {settings.base_model_name_or_path!r}, which is no folder here: say where it is "
+            "as base_model_name_or_path in its adapter_config.json"
+        )
+    if (base / "adapter_config.json").exists():
+        under = load_merged(base, dtype)[0]
+    else:
+        under = load_weights(AutoModelForCausalLM, base, False, dtype=dtype)
+    adapted: Any = PeftModel.from_pretrained(under, str(folder))
+    found: PreTrainedModel = adapted.merge_and_unload().eval()
+    found.config._name_or_path = str(folder)
+    own = (folder / "tokenizer_config.json").exists()
+    return found, load_tokenizer(folder if own else base, False)
 
 
 def merged(model: PreTrainedModel) -> PreTrainedModel:

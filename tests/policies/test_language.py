@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from prefrl.envs.text import Reviews
-from prefrl.policies.language import LanguagePolicy, LanguageSettings
+from prefrl.policies.language import LanguagePolicy, LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
 
 
@@ -39,6 +39,16 @@ def test_responses_that_came_as_text_get_a_begin_and_an_end_token_once(
         assert found.prompt_tokens[i] == one.prompt_tokens
         assert tokenizer.decode(found.tokens[i, found.mask[i]].tolist(), skip_special_tokens=True) == one.text
         assert (found.tokens[i, found.mask[i]] == int(tokenizer.eos_token_id)).sum() == 1
+
+
+def test_where_memory_runs_out_the_setting_is_named_that_halves_it() -> None:
+    with (
+        pytest.raises(MemoryError, match=r"halve learner\.policy\.chunk, which is 64; .*train=lora"),
+        enough_memory("learner.policy.chunk", 64),
+    ):
+        torch.empty(2**60)
+    with pytest.raises(RuntimeError, match="must match"), enough_memory("learner.policy.chunk", 64):
+        torch.ones(2) + torch.ones(3)
 
 
 def test_without_a_critic_there_are_no_values(toy_reviews: Reviews, rng: np.random.Generator) -> None:

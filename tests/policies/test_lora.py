@@ -15,12 +15,13 @@ from transformers import AutoModelForCausalLM, AutoTokenizer
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
+from prefrl.envs.texts import TextsSettings
 from prefrl.improve.text import TextLearner, TextLearnerSettings
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.language import LanguagePolicy, LanguageSettings
+from prefrl.policies.language import LanguagePolicy, LanguageSettings, save_model
 from prefrl.policies.lora import add_adapters, without_adapters
 from prefrl.policies.responses import Responses
-from prefrl.protocols import RewardModel, Store
+from prefrl.protocols import RewardModel, Store, TextTask
 from prefrl.types import Floats, Response
 
 NO_STORE = cast("Store[Response]", None)
@@ -31,13 +32,13 @@ class Long:
         return np.array([len(c.tokens) for c in candidates], np.float32)
 
 
-def learner(task: Reviews, **changes: Any) -> TextLearner:
+def learner(task: TextTask, **changes: Any) -> TextLearner:
     given: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "policy": {"train": "lora", "lora_rank": 4}}
     settings = TextLearnerSettings.model_validate(given | {"learning_rate": 1e-2} | changes)
     return settings.build(task, np.random.default_rng(0))
 
 
-def improved(task: Reviews, **changes: Any) -> TextLearner:
+def improved(task: TextTask, **changes: Any) -> TextLearner:
     one = learner(task, **changes)
     one.improve(cast("RewardModel[Response]", Long()), NO_STORE, np.random.default_rng(1))
     return one
@@ -122,6 +123,31 @@ def test_exported_adapters_are_what_peft_loads(toy_reviews: Reviews, tmp_path: P
     torch.testing.assert_close(_plain(loaded, drawn), policy.log_prob(drawn)[0].detach(), atol=1e-5, rtol=0)
     with pytest.raises(ConfigError, match=r"learner\.policy\.train=full"):
         improved(toy_reviews, policy={"train": "full"}).policy.save(tmp_path / "none", adapter=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*is_gradient_checkpointing:FutureWarning")
+def test_a_start_that_is_an_adapter_is_the_reference_of_what_is_learned_from_it(
+    toy_reviews: Reviews, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    save_model(toy_reviews.model(), toy_reviews, tmp_path / "base", adapter=False)
+    first = improved(TextsSettings(model=tmp_path / "base", prompts=said(tmp_path), response_tokens=8).build()).policy
+    first.save(tmp_path / "adapter", adapter=True)
+    again = TextsSettings(model=tmp_path / "adapter", prompts=said(tmp_path), response_tokens=8).build()
+    second = improved(again).policy
+    drawn = some(second, rng)
+    expected = first.log_prob(drawn)[0].detach()
+    torch.testing.assert_close(second.start_logp(drawn), expected, atol=1e-5, rtol=0)
+    assert not torch.allclose(second.log_prob(drawn)[0], expected, atol=1e-4)
+    (tmp_path / "base").rename(tmp_path / "gone")
+    with pytest.raises(ConfigError, match=r"is an adapter of .*base.*, which is no folder here"):
+        TextsSettings(model=tmp_path / "adapter").build()
+
+
+def said(folder: Path) -> Path:
+    """A file of prompts."""
+    path = folder / "prompts.jsonl"
+    path.write_text("".join(f'{{"prompt": "it was {n}"}}\n' for n in range(16)))
+    return path
 
 
 @torch.no_grad()
