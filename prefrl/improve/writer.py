@@ -69,10 +69,16 @@ class Writer:
 
     def state(self) -> State:
         optimizer = copy.deepcopy(self.optimizer.state_dict())  # its tensors are live, and the next step changes them
-        return {"model": self.policy.state(), "optimizer": optimizer, "steps": list(self.steps)}
+        held = {"optimizer": optimizer, "steps": list(self.steps), "start": self.policy.start_digest()}
+        return {"model": self.policy.state(), **held}
 
     def load(self, state: State) -> None:
-        """Raises ValueError where names or shapes differ."""
+        """Raises ValueError where names or shapes differ, or the starting policy is another one."""
+        if state.get("start", self.policy.start_digest()) != self.policy.start_digest():  # older states do not say
+            raise ValueError(
+                "policy: it started from other weights than those that are there now: put back the model that the run "
+                "began with, or begin a new run"
+            )
         self.policy.load(state["model"])
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # which may keep the very tensors it is given
         self.steps = Steps(*state["steps"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
@@ -21,9 +22,12 @@ from prefrl.policies.logprobs import all_logp, response_logp, shortcuts_of
 from prefrl.policies.pretrained import context_of, quiet
 from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
-from prefrl.seeding import generator
+from prefrl.seeding import generator, to_numpy
 from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
+
+DIGESTED = 1000
+"""About so many numbers of each matrix tell models apart."""
 
 
 class LanguageSettings(Settings):
@@ -148,6 +152,16 @@ class LanguagePolicy:
         found = responses.candidates(self.task.tokenizer)
         gold = self.task.gold(found)
         return [replace(r, gold=gold[i : i + 1]) for i, r in enumerate(found)]
+
+    def start_digest(self) -> str:
+        """sha256 over names and samples of the starting policy's weights, in the precision that all runs have."""
+        found = hashlib.sha256()
+        for name, value in self.start.named_parameters():
+            if "lora_" not in name:
+                some = value.detach().flatten()[:: max(1, value.numel() // DIGESTED)].bfloat16()
+                found.update(name.replace("base_layer.", "").encode())
+                found.update(to_numpy(some.view(torch.int16)).tobytes())
+        return found.hexdigest()
 
     def save(self, folder: Path, adapter: bool = False) -> None:
         """Write what transformers' `from_pretrained` loads: the whole model, or its adapters alone for peft's."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -489,3 +490,13 @@ def test_an_algorithm_fills_in_defaults_and_what_is_set_beside_it_stands() -> No
     assert (grpo.advantage, grpo.clip, grpo.kl_in, grpo.reduction) == ("group_normalised", 0.2, "reward", "sequence")
     assert TextLearnerSettings.model_validate(grpo.model_dump()) == grpo
     assert TextLearnerSettings(algorithm="reinforce").advantage == "batch_mean"
+
+
+def test_a_policy_takes_over_what_was_learned_from_its_own_start_alone(toy_reviews: Reviews) -> None:
+    one, adapted = learner(toy_reviews), learner(toy_reviews, policy={"train": "lora"})
+    assert one.policy.start_digest() == adapted.policy.start_digest()
+    one.policy.start = copy.deepcopy(one.policy.start)
+    with torch.no_grad():
+        next(one.policy.start.parameters())[5] += 0.01
+    with pytest.raises(ValueError, match="started from other weights"):
+        learner(toy_reviews).load(one.state())
