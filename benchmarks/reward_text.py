@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,12 +22,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from turns import ask, start, wait
+
 PAIRS, LEAST, MOST, PROMPT, VOCABULARY, HELD_OUT = 32, 40, 88, 16, 8192, 128
 GOOD, BAD = range(10, 138), range(138, 266)
 """The planted rule: the response with the larger share of good words is the better one."""
 LEARNING_RATE = 5e-4
 WARM_UP = 2
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false"}
 
 
 def main() -> None:
@@ -113,8 +112,8 @@ def read_pairs(folder: Path) -> tuple[list[Any], list[Any]]:
 def compare(folder: Path, peers: str, steps: int, precision: str) -> dict[str, Any]:
     """Let both sides make a gradient step in turn; the first two are for warming up."""
     workers = {
-        "ours": start("ours", sys.executable, folder, precision),
-        "peer": start("peer", peers, folder, precision),
+        name: start([python, __file__, "--worker", name, "--folder", str(folder), "--precision", precision])
+        for name, python in (("ours", sys.executable), ("peer", peers))
     }
     seconds: dict[str, list[float]] = {"ours": [], "peer": []}
     for i in range(steps):
@@ -141,26 +140,6 @@ def compare(folder: Path, peers: str, steps: int, precision: str) -> dict[str, A
     }
 
 
-def start(name: str, python: str, folder: Path, precision: str) -> subprocess.Popen[str]:
-    command = [python, __file__, "--worker", name, "--folder", str(folder), "--precision", precision]
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ONE_THREAD}
-    )
-
-
-def ask(worker: subprocess.Popen[str]) -> dict[str, Any]:
-    """Have one step made, or after the last one the rest; other lines that a library prints are passed over."""
-    assert worker.stdin is not None
-    assert worker.stdout is not None
-    worker.stdin.write("go\n")
-    worker.stdin.flush()
-    for line in worker.stdout:
-        if line.startswith("RESULT "):
-            found: dict[str, Any] = json.loads(line[7:])
-            return found
-    raise RuntimeError(f"{worker.args!r} ended early")
-
-
 class Turns:
     """Wait for our turn, and say what it took when it is over."""
 
@@ -168,9 +147,7 @@ class Turns:
         self.begin = 0.0
 
     def wait(self) -> None:
-        if not sys.stdin.readline():
-            sys.exit()
-        self.begin = time.process_time()
+        self.begin = wait()
 
     def tell(self, **more: float) -> None:
         print("RESULT " + json.dumps({"seconds": time.process_time() - self.begin, **more}), flush=True)

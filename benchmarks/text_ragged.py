@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--size", choices=SIZES, default="1m")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        make_model(Path(folder), options.size, ENDS_AFTER)
+        make_model(Path(folder), options.size, ends_after=ENDS_AFTER)
         work = Update(folder, PROMPTS, SAMPLES, NEW_TOKENS, fixed=False, learning_rate=STEP)
         found = compare(work, options.peers, 7 if options.short else 30)
     said = f"one RLOO update, {options.size}, {PROMPTS * SAMPLES} responses of 1 to {NEW_TOKENS} tokens, fp32"

@@ -1,9 +1,9 @@
 """One RLOO or GRPO update of a Llama: prefrl's text learner against TRL's trainers, at equal work.
 
-    python benchmarks/text_rloo.py [--size 1m|13m] [--algorithm rloo|grpo] [--short] [--peers PYTHON]
+    python benchmarks/text_rloo.py [--size 1m|13m] [--algorithm rloo|grpo] [--prompt-tokens N] [--short]
 
-16 prompts of 8 tokens x 4 responses of 48 tokens, float32; see text_updates.py. `ratio` is peer / ours: above 1, prefrl
-needs fewer CPU seconds.
+16 prompts of 8 tokens, or as many as said, x 4 responses of 48 tokens, float32; see text_updates.py. `ratio` is peer /
+ours: above 1, prefrl needs fewer CPU seconds.
 """
 
 from __future__ import annotations
@@ -23,16 +23,20 @@ def main() -> None:
     parser = options_of(__doc__)
     parser.add_argument("--size", choices=SIZES, default="1m")
     parser.add_argument("--algorithm", choices=("rloo", "grpo"), default="rloo")
+    parser.add_argument("--prompt-tokens", type=int, default=PROMPT_TOKENS, help="up to 200")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        make_model(Path(folder), options.size)
+        make_model(Path(folder), options.size, options.prompt_tokens)
         work = Update(folder, PROMPTS, SAMPLES, NEW_TOKENS, algorithm=options.algorithm)
         found = compare(work, options.peers, 5 if options.short else 20)
-    said = f"one {options.algorithm.upper()} update, {options.size}, {PROMPTS * SAMPLES} x {NEW_TOKENS} tokens, fp32"
+    said = (
+        f"one {options.algorithm.upper()} update, {options.size}, {PROMPTS} prompts of {options.prompt_tokens} tokens "
+        f"x {SAMPLES} responses of {NEW_TOKENS}, fp32"
+    )
     print(json.dumps({"name": f"text_rloo: {said}"} | found | {"short": options.short}))
 
 
-def make_model(folder: Path, size: str, ends_after: int = 0) -> None:
+def make_model(folder: Path, size: str, prompt_tokens: int = PROMPT_TOKENS, ends_after: int = 0) -> None:
     """Random weights, a tokenizer of whole words, t0 ... t2047, and prompts, for both sides to read.
 
     `ends_after`: let every token be the end token with a chance of 1 in so many.
@@ -63,7 +67,7 @@ def make_model(folder: Path, size: str, ends_after: int = 0) -> None:
     words.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
     tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, pad_token="t0", bos_token="t1", eos_token="t2")
     tokenizer.save_pretrained(folder)
-    prompts = [" ".join(f"t{10 + (997 * i + 7 * j) % (WORDS - 10)}" for j in range(PROMPT_TOKENS)) for i in range(997)]
+    prompts = [" ".join(f"t{10 + (997 * i + 7 * j) % (WORDS - 10)}" for j in range(prompt_tokens)) for i in range(997)]
     (folder / "prompts.json").write_text(json.dumps(prompts))
 
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 import argparse
 import copy
 import json
-import os
 import resource
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -21,8 +19,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
+from turns import ask, start, wait
+
 BETA = 0.05
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TOKENIZERS_PARALLELISM": "false"}
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,10 @@ def compare(work: Update, peers: str, repetitions: int) -> dict[str, Any]:
     """
     if not Path(peers).exists():
         sys.exit(f"no {peers}: run `make peers`, or install benchmarks/peers-text.txt and say --peers")
-    workers = {name: start(name, python, work) for name, python in {"ours": sys.executable, "peer": peers}.items()}
+    said = json.dumps(asdict(work))
+    workers = {
+        name: start([python, __file__, name, said]) for name, python in {"ours": sys.executable, "peer": peers}.items()
+    }
     seconds: dict[str, list[float]] = {"ours": [], "peer": []}
     found: dict[str, Any] = {}
     for i in range(repetitions + 2):
@@ -99,33 +101,6 @@ def compare(work: Update, peers: str, repetitions: int) -> dict[str, Any]:
         "repetitions": repetitions,
         "peak_gb": {name: round(found[name]["peak_gb"], 2) for name in found},
     }
-
-
-def start(name: str, python: str, work: Update) -> subprocess.Popen[str]:
-    command = [python, __file__, name, json.dumps(asdict(work))]
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ONE_THREAD}
-    )
-
-
-def ask(worker: subprocess.Popen[str]) -> dict[str, Any]:
-    """Have one update made; other lines that a library prints are passed over."""
-    assert worker.stdin is not None
-    assert worker.stdout is not None
-    worker.stdin.write("go\n")
-    worker.stdin.flush()
-    for line in worker.stdout:
-        if line.startswith("RESULT "):
-            found: dict[str, Any] = json.loads(line[7:])
-            return found
-    raise RuntimeError(f"{worker.args!r} ended early")
-
-
-def wait() -> float:
-    """Wait for our turn; the time at which it begins."""
-    if not sys.stdin.readline():
-        sys.exit()
-    return time.process_time()
 
 
 def tell(begin: float, tokens: int) -> None:
