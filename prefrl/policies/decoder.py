@@ -101,6 +101,8 @@ def plan(model: PreTrainedModel, length: int) -> Plan | None:
 class FastDecoder:
     """Tokens one by one, from the prompts' keys and values on. Reads the model's weights when it is made."""
 
+    joins = True
+
     def __init__(self, plan: Plan, cache: Cache, mask: Tensor, samples: int, room: int) -> None:
         """`cache` and `mask` (P, T): of left-padded prompts, each to be continued `samples` times by `room` steps."""
         self._plan = plan
@@ -140,8 +142,6 @@ class FastDecoder:
         flat = (rows[:, None] * groups + torch.arange(groups, device=rows.device)).flatten()
         self._cache = [(keys[flat], values[flat]) for keys, values in self._cache]
         self._bias = self._bias[flat]
-
-    joins = True
 
     def join(self, other: FastDecoder) -> None:
         positions = torch.cat([self._positions, other._positions])

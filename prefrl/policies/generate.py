@@ -226,14 +226,14 @@ def _decode(opener: _Opener, uniform: Tensor, at_once: int | None) -> Generation
     while True:
         drawn, on = _draw_next(going, opener.sampling, uniform, found)
         left = int(on.sum())
-        place = (most * samples - left) // samples  # for so many prompts
         if not left and not opener.waiting:
             return found
-        refill = place >= (1 - KEEP_SHARE) * most and (not left or going.decoder.joins)
-        more = opener.open(min(place, opener.waiting)) if refill and opener.waiting else None
         if not left:
-            going = more or opener.open(min(most, opener.waiting))
+            going = opener.open(min(most, opener.waiting))
             continue
+        place = (most * samples - left) // samples  # for so many prompts
+        refill = opener.waiting and place >= (1 - KEEP_SHARE) * most and going.decoder.joins
+        more = opener.open(min(place, opener.waiting)) if refill else None
         if left <= KEEP_SHARE * len(on) or more:
             kept = on.nonzero()[:, 0]
             going.decoder.keep(kept)

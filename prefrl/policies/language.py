@@ -27,7 +27,7 @@ from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
 
 DIGESTED = 1000
-"""About so many numbers of each matrix tell models apart."""
+"""About this many numbers of each matrix are enough to tell models apart."""
 
 
 class LanguageSettings(Settings):
@@ -42,8 +42,8 @@ class LanguageSettings(Settings):
     chunk: int = Field(64, ge=2)
     """Responses in one pass of a network while learning: changes memory and speed, and nothing else but rounding."""
     at_once: int = Field(256, ge=1)
-    """Responses that are written at the same time, or all of one prompt's: where some end, others are begun. Changes
-    memory and speed, and nothing else but rounding."""
+    """The most responses that are written at the same time (but never fewer than one prompt's): as some end, others are
+    begun. Changes memory and speed, and nothing else but rounding."""
 
 
 @contextmanager

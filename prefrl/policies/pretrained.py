@@ -88,9 +88,14 @@ def context_of(model: PreTrainedModel) -> int | None:
     return None if known is None else int(known)
 
 
+WINDOWS = ("sliding_window", "window_size", "attention_chunk_size")
+"""What configs of transformers call it."""
+
+
 def window_of(model: PreTrainedModel) -> int | None:
-    """How many tokens back a token looks, where attention has such a window."""
-    return getattr(model.config, "sliding_window", None) or None
+    """How many tokens back a token looks, where some layer's attention has such a window."""
+    found = [size for name in WINDOWS if isinstance(size := getattr(model.config, name, None), int) and size > 0]
+    return min(found, default=None)
 
 
 def first_line(error: Exception) -> str:

@@ -73,15 +73,17 @@ def test_a_prompt_that_is_run_once_gets_the_gradient_of_all_its_responses(name: 
     assert shortcuts_of(model).prompts_once
 
 
-@pytest.mark.parametrize("name", ["gpt_neo", "mpt"])
-def test_prompts_are_run_once_only_where_that_changes_nothing(name: str) -> None:
-    """Their attention counts columns, padding included."""
-    assert not shortcuts_of(tiny(name)).prompts_once
+def test_prompts_are_run_once_only_where_that_changes_nothing() -> None:
+    """Its attention counts columns, padding included."""
+    assert not shortcuts_of(tiny("mpt")).prompts_once
 
 
-def test_prompts_that_a_window_may_cut_are_run_with_each_response(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = tiny("mistral")
-    monkeypatch.setattr(model.config, "sliding_window", 12)
+@pytest.mark.parametrize(("name", "window"), [("mistral", "sliding_window"), ("gpt_neo", "window_size")])
+def test_prompts_that_a_window_may_cut_are_run_with_each_response(
+    name: str, window: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tiny(name)
+    monkeypatch.setattr(model.config, window, 12)
     prompts = [[5, 6, 7] * n for n in (1, 1, 4, 4)]
     mask = torch.ones(4, 6, dtype=torch.bool)
     rows = rows_of(prompts, torch.full((4, 6), 9), mask)
