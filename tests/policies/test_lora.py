@@ -138,6 +138,9 @@ def test_a_start_that_is_an_adapter_is_the_reference_of_what_is_learned_from_it(
     expected = first.log_prob(drawn)[0].detach()
     torch.testing.assert_close(second.start_logp(drawn), expected, atol=1e-5, rtol=0)
     assert not torch.allclose(second.log_prob(drawn)[0], expected, atol=1e-4)
+    second.save(tmp_path / "second", adapter=True)  # its base is an adapter itself
+    third = LanguagePolicy(TextsSettings(model=tmp_path / "second").build(), 1.0, LanguageSettings(), rng)
+    torch.testing.assert_close(third.start_logp(drawn), second.log_prob(drawn)[0].detach(), atol=1e-5, rtol=0)
     (tmp_path / "base").rename(tmp_path / "gone")
     with pytest.raises(ConfigError, match=r"is an adapter of .*base.*, which is no folder here"):
         TextsSettings(model=tmp_path / "adapter").build()
