@@ -184,7 +184,7 @@ def policy_of(folder: Path) -> LanguagePolicy:
     try:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
-        raise RunError(f"{folder} holds no policy: {error}") from error
+        raise RunError(f"{folder}: {error}") from error
     return learner.policy
 
 
@@ -244,7 +244,7 @@ def evaluate(folder: Path) -> Evaluation:
     try:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
-        raise RunError(f"{folder} holds no policy to evaluate: {error}") from error
+        raise RunError(f"{folder}: {error}") from error
     evaluation: Evaluation = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
     return evaluation
 

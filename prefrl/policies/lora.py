@@ -7,6 +7,7 @@ attention; scaled by 2 whatever the rank is, without dropout. Left out: biases, 
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,8 +111,10 @@ def load_merged(folder: Path, dtype: Precision) -> tuple[PreTrainedModel, PreTra
         under = load_merged(base, dtype)[0]
     else:
         under = load_weights(AutoModelForCausalLM, base, False, dtype=dtype)
-    adapted: Any = PeftModel.from_pretrained(under, str(folder))
-    found: PreTrainedModel = adapted.merge_and_unload().eval()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # peft asks the model for what transformers will rename
+        adapted: Any = PeftModel.from_pretrained(under, str(folder))
+    found: PreTrainedModel = adapted.merge_and_unload().eval().requires_grad_(True)  # peft has frozen it
     found.config._name_or_path = str(folder)
     own = (folder / "tokenizer_config.json").exists()
     return found, load_tokenizer(folder if own else base, False)

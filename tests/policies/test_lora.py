@@ -125,7 +125,6 @@ def test_exported_adapters_are_what_peft_loads(toy_reviews: Reviews, tmp_path: P
         improved(toy_reviews, policy={"train": "full"}).policy.save(tmp_path / "none", adapter=True)
 
 
-@pytest.mark.filterwarnings("ignore:.*is_gradient_checkpointing:FutureWarning")
 def test_a_start_that_is_an_adapter_is_the_reference_of_what_is_learned_from_it(
     toy_reviews: Reviews, tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -138,6 +137,9 @@ def test_a_start_that_is_an_adapter_is_the_reference_of_what_is_learned_from_it(
     expected = first.log_prob(drawn)[0].detach()
     torch.testing.assert_close(second.start_logp(drawn), expected, atol=1e-5, rtol=0)
     assert not torch.allclose(second.log_prob(drawn)[0], expected, atol=1e-4)
+    whole = improved(again, policy={"train": "full"}).policy
+    torch.testing.assert_close(whole.start_logp(drawn), expected, atol=1e-5, rtol=0)
+    assert all(p.requires_grad for p in whole.model.parameters())
     second.save(tmp_path / "second", adapter=True)  # its base is an adapter itself
     third = LanguagePolicy(TextsSettings(model=tmp_path / "second").build(), 1.0, LanguageSettings(), rng)
     torch.testing.assert_close(third.start_logp(drawn), second.log_prob(drawn)[0].detach(), atol=1e-5, rtol=0)
