@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def make_model(folder: Path, size: str, prompt_tokens: int = PROMPT_TOKENS, ends_after: int = 0) -> None:
-    """Random weights, a tokenizer of whole words, t0 ... t2047, and prompts, for both sides to read.
+    """Random weights, a tokenizer of whole words, t3 ... t2047, and prompts, for both sides to read.
 
     `ends_after`: let every token be the end token with a chance of 1 in so many.
     """
@@ -63,9 +63,12 @@ def make_model(folder: Path, size: str, prompt_tokens: int = PROMPT_TOKENS, ends
     if ends_after:
         _let_it_end(model, ends_after)
     model.save_pretrained(folder)
-    words = Tokenizer(models.WordLevel({f"t{i}": i for i in range(WORDS)}, unk_token="t3"))
+    special = ["<pad>", "<begin>", "<end>"]  # no word may begin with one: "t1" would be found in "t17"
+    table = {word: i for i, word in enumerate([*special, *(f"t{i}" for i in range(3, WORDS))])}
+    words = Tokenizer(models.WordLevel(table, unk_token="t3"))
     words.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
-    tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, pad_token="t0", bos_token="t1", eos_token="t2")
+    names = dict(zip(("pad_token", "bos_token", "eos_token"), special, strict=True))
+    tokenizer = PreTrainedTokenizerFast(tokenizer_object=words, **names)
     tokenizer.save_pretrained(folder)
     prompts = [" ".join(f"t{10 + (997 * i + 7 * j) % (WORDS - 10)}" for j in range(prompt_tokens)) for i in range(997)]
     (folder / "prompts.json").write_text(json.dumps(prompts))
