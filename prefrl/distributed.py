@@ -57,6 +57,15 @@ class World:
             dist.all_gather(found, padded)
         return torch.stack(found, 1).flatten(0, 1)[:count]  # (most, size, ...): row by row, and rank by rank in each
 
+    def any(self, here: bool) -> bool:
+        """Whether it is so on any rank."""
+        if self.size == 1:
+            return here
+        found = torch.tensor(float(here))
+        with _heard():
+            dist.all_reduce(found, dist.ReduceOp.MAX)
+        return bool(found)
+
     def gathered(self, mine: T) -> list[T]:
         """What each rank has, in their order."""
         if self.size == 1:
@@ -67,10 +76,17 @@ class World:
         return cast("list[T]", found)
 
     def sum_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:
-        """Give every rank the sum of all ranks' gradients, to the same bits; a missing one counts as 0."""
+        """Give every rank the sum of all ranks' gradients, to the same bits; a missing one counts as 0.
+
+        Of parameters that are spread over ranks that was done while they were computed.
+        """
         if self.size == 1:
             return
+        from torch.distributed.tensor import DTensor  # takes half a second to load
+
         learning = [p for p in parameters if p.requires_grad]
+        if isinstance(learning[0], DTensor):
+            return
         # Behind them, whether there is one at all: what no rank has a gradient of is left alone by optimisers.
         some = learning[0].new_tensor([p.grad is not None for p in learning], dtype=torch.float32)
         gradients = [(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in learning]
@@ -80,6 +96,15 @@ class World:
         *totals, some = flat.split([*(p.numel() for p in learning), len(learning)])  # type: ignore[no-untyped-call]
         for parameter, total, known in zip(learning, totals, some.tolist(), strict=True):
             parameter.grad = total.view_as(parameter).to(parameter.dtype) if known else None
+
+    def clip_gradients(self, parameters: Iterable[torch.nn.Parameter], longest: float) -> float:
+        """Shorten the gradient where it is longer than that; returns how long it was."""
+        norm = torch.nn.utils.clip_grad_norm_(parameters, longest)
+        if self.size > 1:
+            from torch.distributed.tensor import DTensor
+
+            norm = norm.full_tensor() if isinstance(norm, DTensor) else norm
+        return float(norm)
 
     def first(self, call: Callable[[], T]) -> T:
         """What `call` returns on rank 0, on all ranks; what it raises there, all raise. The others do not call it."""
@@ -177,10 +202,25 @@ def _heard() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise LostRanksError(
-            f"rank {_joined.rank} of {_joined.size} hears no more of another one, which has ended; what was finished "
-            "is kept: start again, and the run goes on from there"
-        ) from error
+        raise _lost() from error
+
+
+@contextmanager
+def heard_by_torch() -> Iterator[None]:
+    """Here torch speaks to the other ranks by itself: what goes wrong may be that they do not answer."""
+    try:
+        yield
+    except RuntimeError as error:
+        if isinstance(error, dist.DistBackendError) or "gloo" in str(error):
+            raise _lost() from error
+        raise
+
+
+def _lost() -> LostRanksError:
+    return LostRanksError(
+        f"rank {_joined.rank} of {_joined.size} hears no more of another one, which has ended; what was finished is "
+        "kept: start again, and the run goes on from there"
+    )
 
 
 def _outcome(call: Callable[[], T]) -> T | Exception:
@@ -188,3 +228,15 @@ def _outcome(call: Callable[[], T]) -> T | Exception:
         return call()
     except Exception as error:
         return error
+
+
+def each_tensor(state: T, change: Callable[[Tensor], Tensor]) -> T:
+    """The same dictionaries and lists, with their tensors changed."""
+    found: object = state
+    if isinstance(state, dict):
+        found = {key: each_tensor(one, change) for key, one in state.items()}
+    elif isinstance(state, list):
+        found = [each_tensor(one, change) for one in state]
+    elif isinstance(state, Tensor):
+        found = change(state)
+    return cast("T", found)

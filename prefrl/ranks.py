@@ -15,12 +15,12 @@ import numpy as np
 import torch
 
 from prefrl.components import Settings
-from prefrl.distributed import joined, together, world
+from prefrl.distributed import each_tensor, heard_by_torch, joined, together, world
 from prefrl.judgements import Answer, Judged
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store, text
-from prefrl.seeding import to_numpy
-from prefrl.types import C, Floats, Json, Query, Round, State
+from prefrl.seeding import to_host, to_numpy
+from prefrl.types import C, Floats, Json, Query, Round
 
 
 class RanksError(RuntimeError):
@@ -144,7 +144,9 @@ def rounds(loop: Loop[C]) -> Iterator[Round[C]]:
     found = loop.run()
     while True:
         with together() as ranks:
-            if (round := next(found, None)) is None:
+            with heard_by_torch():
+                round = next(found, None)
+            if round is None:
                 return
             if len(set(ranks.gathered(_digest(loop.learner, loop.reward) if ranks.size > 1 else ""))) > 1:
                 raise RanksError(
@@ -158,25 +160,12 @@ def _align(loop: Loop[C]) -> None:
     """Stand where rank 0 stands."""
     round, sequence, learner, reward = world().first(
         # Not from GPU to GPU: each rank would have a copy on that of rank 0.
-        lambda: (loop.round, loop.sequence, _on_cpu(loop.learner.state()), _on_cpu(loop.reward.state()))
+        lambda: (loop.round, loop.sequence, *each_tensor([loop.learner.state(), loop.reward.state()], to_host))
     )
     if world().rank:
         loop.round, loop.sequence = round, sequence
         loop.learner.load(learner)
         loop.reward.load(reward)
-
-
-def _on_cpu(state: State) -> State:
-    """The same, with its tensors there."""
-
-    def moved(value: object) -> object:
-        if isinstance(value, dict):
-            return {key: moved(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [moved(one) for one in value]
-        return value.cpu() if isinstance(value, torch.Tensor) else value
-
-    return {key: moved(value) for key, value in state.items()}
 
 
 def _digest(*parts: Learner[C] | RewardModel[C]) -> str:

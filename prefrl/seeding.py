@@ -74,6 +74,11 @@ def device_of(name: Device) -> torch.device:
     return torch.device(("cuda" if found else "cpu") if name == "auto" else name)
 
 
+def to_host(value: torch.Tensor) -> torch.Tensor:
+    """In the memory of the CPU."""
+    return value.cpu()
+
+
 def to_numpy(tensor: torch.Tensor) -> npt.NDArray[Any]:
     """A tensor of any device as an array; of one on the CPU it is a view."""
     found: npt.NDArray[Any] = tensor.detach().cpu().numpy()

@@ -12,6 +12,7 @@ import torch
 from runs import small_reviews
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from torch.distributed.tensor import DTensor
 
 from prefrl import distributed
 from prefrl.components import settings_class
@@ -22,7 +23,7 @@ from prefrl.improve.dpo import DPOSettings
 from prefrl.improve.text import TextLearnerSettings
 from prefrl.judgements import Comparison, Judged
 from prefrl.protocols import RewardModel
-from prefrl.types import Query, Response, Segment
+from prefrl.types import Query, Response, Segment, State
 
 Found: TypeAlias = dict[str, Tensor]
 Work: TypeAlias = Callable[..., Found]
@@ -114,6 +115,42 @@ def policies(cache: Path) -> Found:
     found |= dict(learned("dpo", direct.policy.parameters()))
     evaluated = direct.evaluate(LIKES, np.random.default_rng(4)).metrics
     return found | {"evaluated": torch.tensor([evaluated[key] for key in sorted(evaluated)])}
+
+
+SPREAD: dict[str, dict[str, Any]] = {
+    "rloo": BATCH | {"policy": {"chunk": 4}, "max_grad_norm": 0.05},
+    "rloo with adapters": BATCH | {"policy": {"chunk": 4, "train": "lora", "lora_rank": 4}},
+    "grpo": BATCH | {"algorithm": "grpo", "epochs": 2, "minibatches": 2, "policy": {"chunk": 4}},
+}
+
+
+def spread_out(cache: Path) -> Found:
+    """Two rounds of learners whose weights are spread over the ranks, with a pause between them."""
+    task = small_reviews(cache)
+    found: Found = {}
+    for name, settings in SPREAD.items():
+        settings = settings | {"policy": settings["policy"] | {"shard": "fsdp2"}}
+        learner = TextLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
+        learner.improve(LIKES, None, np.random.default_rng(1))  # type: ignore[arg-type]
+        again = TextLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
+        again.load(learner.state())
+        metrics = again.improve(LIKES, None, np.random.default_rng(2))  # type: ignore[arg-type]
+        found |= saved(name, again.state())
+        held = [p.to_local() if isinstance(p, DTensor) else p for p in again.policy.parameters()]
+        found[f"{name}: held"] = torch.tensor(sum(p.numel() for p in held))
+        found[f"{name}: metrics"] = torch.tensor([metrics[key] for key in sorted(metrics) if key != "ratio_error"])
+    drawn = learner.policy.respond(["The plot was"], 2, np.random.default_rng(3))  # not for all ranks
+    found["one prompt"] = learner.policy.start_logp(drawn)
+    direct = DPOSettings(minibatch=6, policy={"chunk": 4, "shard": "fsdp2"}).build(task, np.random.default_rng(0))
+    direct.improve(LIKES, Few(direct.sample(12, np.random.default_rng(2))), np.random.default_rng(3))  # type: ignore[arg-type]
+    return found | saved("dpo", direct.state())
+
+
+def saved(name: str, state: State) -> Found:
+    """What was learned, and what the optimiser knows of it."""
+    held = state["optimizer"]["state"]
+    found = {"parameters": list(state["model"].values()), "moments": [one["exp_avg"] for one in held.values()]}
+    return {f"{name}: {what}": torch.cat([one.flatten() for one in tensors]) for what, tensors in found.items()}
 
 
 class Few:

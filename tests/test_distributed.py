@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from rank_cases import Work, on_ranks, pieces, policies, rewards
+from rank_cases import Work, on_ranks, pieces, policies, rewards, spread_out
 
 from prefrl import distributed
 from prefrl.distributed import World
@@ -57,3 +57,18 @@ def test_an_update_is_the_same_on_any_number_of_ranks(
         apart = float(((found[0][name] - expected) * known).norm() / expected.norm())
         # Float32 itself: the gradient with adapters is 2e-6 from the one in float64, on one rank as on two.
         assert apart <= 5e-6, f"{name}: {apart:.2g} from one rank"
+
+
+def test_weights_that_are_spread_over_ranks_learn_as_whole_ones_do(
+    toy_reviews: Reviews, models: Path, tmp_path: Path
+) -> None:
+    alone = spread_out(models)
+    found = on_ranks(2, tmp_path / "ranks", spread_out, models)
+    for name, expected in alone.items():
+        first, second = (one[name] for one in found)
+        if name.endswith("held"):
+            assert int(first + second) == int(expected)
+            assert float(first / expected) == pytest.approx(0.5, abs=0.01)
+        else:
+            assert torch.equal(first, second), name
+            assert float((first - expected).norm() / expected.norm()) <= 1e-5, name

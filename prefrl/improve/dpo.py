@@ -101,6 +101,7 @@ class DPO:
 
     def _parts(self, data: Batch[Response], rows: Responses, reference: Tensor, at: Integers) -> Parts:
         """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
+        self.policy.check_share(len(at))
         for some in in_parts(at, self._settings.policy.chunk // 2):
             # Shares of the whole minibatch: the parts add up to its mean. The two of a pair stand side by side: (2 m,).
             arrays = (data.weight[some] / data.weight[at].sum(), data.edges[some].flatten(), data.preference[some])

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,7 +87,7 @@ class Batch(Generic[I]):
             return
         mine = self.inputs.order()[world().mine]
         if len(mine):  # there may be fewer sequences than ranks
-            for at in mine.split(size or len(mine)):  # type: ignore[no-untyped-call]
+            for at in mine.tensor_split(parts_of(len(self), size)):
                 yield self.rows(at)
 
 
@@ -149,7 +150,7 @@ def descend(
         measured.append(torch.stack([loss.detach(), *seen.values()]))
     world().sum_gradients(parameters)
     metrics = _added(names, torch.stack(measured).tolist() if measured else [])
-    metrics["grad_norm"] = float(torch.nn.utils.clip_grad_norm_(parameters, max_grad_norm))
+    metrics["grad_norm"] = world().clip_gradients(parameters, max_grad_norm)
     for name in ("loss", "grad_norm"):
         if not math.isfinite(metrics[name]):
             raise FloatingPointError(
@@ -163,8 +164,17 @@ def descend(
 def in_parts(at: Integers, size: int) -> Iterator[Integers]:
     """This rank's share of some rows, at most so many at a time."""
     mine = at[world().mine]
-    for start in range(0, len(mine), size):
-        yield mine[start : start + size]
+    if len(mine):
+        yield from (some for some in np.array_split(mine, parts_of(len(at), size)) if len(some))
+
+
+def parts_of(count: int, size: int | None) -> int:
+    """In how many parts, of at most `size`, each rank takes its share of so many rows.
+
+    As many on all ranks that have any: where weights are spread over ranks, each waits for the others in every part.
+    """
+    most = -(-count // world().size)
+    return -(-most // (size or most))
 
 
 def _added(names: tuple[str, ...], parts: list[list[float]]) -> Metrics:

@@ -129,6 +129,8 @@ class TextLearnerSettings(Settings):
             raise ValueError(f"{self.prompts} x {self.responses} responses cannot be {self.minibatches} minibatches")
         if self.reference_every and self.reference_mix < 1 and self.policy.train == "lora":
             raise ValueError("parts of two adapters are no adapter between the two: with LoRA set reference_mix=1")
+        if self.reference_every and self.policy.shard != "none":
+            raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=0")
         if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
             raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
         if self.kl_target is not None and self.beta == 0:
@@ -305,7 +307,9 @@ class TextLearner:
         order = generator(rng)
         each = -(-size // self._settings.minibatches)  # rounded up, so that there are no more than asked for
         orders = [torch.randperm(size, generator=order).to(self.policy.device) for _ in range(self._settings.epochs)]
-        return [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
+        found: list[Tensor] = [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
+        self.policy.check_share(min(map(len, found)))
+        return found
 
     def _shaped(self, raw: Tensor, drawn: Responses) -> Tensor:
         """(B,): the scores that are learned from, NaN where there is none."""

@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from prefrl.distributed import each_tensor, joined, world
 from prefrl.evaluate.policies import responses
 from prefrl.improve.gradient import adam
 from prefrl.policies.language import LanguagePolicy, LanguageSettings
@@ -45,9 +46,13 @@ class Writer:
     ) -> None:
         """`temperature`: of sampling, and of every log-probability in the objective."""
         self.policy = LanguagePolicy(task, temperature, settings.policy, rng)
-        self.policy.to(device_of(settings.device))
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self.steps = Steps()
+        self._gathered = self._gather() if self.policy.spread else {}
+        """What rank 0 gathered last of a policy that is spread over ranks: it saves while the others are elsewhere."""
+        self.policy.to(device_of(settings.device))
+        # To be spread makes other parameters of them.
+        self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
 
     def ask(self, count: int, each: int, rng: np.random.Generator) -> list[Response]:
         """At least `count` responses to be asked about, `each` to a random prompt, gold attached."""
@@ -68,9 +73,12 @@ class Writer:
         return evaluated
 
     def state(self) -> State:
-        optimizer = copy.deepcopy(self.optimizer.state_dict())  # its tensors are live, and the next step changes them
-        held = {"optimizer": optimizer, "steps": list(self.steps), "start": self.policy.start_digest()}
-        return {"model": self.policy.state(), **held}
+        if self.policy.spread and world().size == 1:
+            return self._gathered
+        found = self._gather()
+        if self.policy.spread and world().rank == 0:
+            self._gathered = found
+        return found
 
     def load(self, state: State) -> None:
         """Raises ValueError where names or shapes differ, or the starting policy is another one."""
@@ -80,5 +88,24 @@ class Writer:
                 "began with, or begin a new run"
             )
         self.policy.load(state["model"])
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))  # which may keep the very tensors it is given
+        self.optimizer.load_state_dict(self._shares(state["optimizer"]))
         self.steps = Steps(*state["steps"])
+        if self.policy.spread and joined().rank == 0:
+            self._gathered = state
+
+    def _gather(self) -> State:
+        # The optimiser's tensors are live, and the next step changes them.
+        optimizer = each_tensor(self.optimizer.state_dict(), self.policy.keeping.whole)
+        held = {"optimizer": optimizer, "steps": list(self.steps), "start": self.policy.start_digest()}
+        return {"model": self.policy.state(), **held}
+
+    def _shares(self, state: State) -> State:
+        """An optimiser's state of its own: of what is as large as its parameter, this rank's share."""
+        state = copy.deepcopy(state)  # the optimiser may keep the very tensors that it is given
+        parameters = self.policy.parameters()
+        for number, held in state["state"].items():
+            of = parameters[number]
+            for name, value in held.items():
+                if value.shape == of.shape:
+                    held[name] = self.policy.keeping.share(value, of)
+        return state

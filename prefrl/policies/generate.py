@@ -7,6 +7,7 @@ have ended leave the batch. What comes back was drawn from the raw policy: no ge
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, Self
 
@@ -18,6 +19,8 @@ from transformers.cache_utils import DynamicLayer
 from prefrl.distributed import world
 from prefrl.policies.decoder import FastDecoder, plan, right
 
+ALONE: AbstractContextManager[None] = nullcontext()
+"""What surrounds the passes of a model that this rank has whole: nothing."""
 KEEP_SHARE = 0.75
 """Ended rows are dropped once this share or less of the rows goes on: moving the cache costs more than a few rows."""
 
@@ -120,11 +123,13 @@ def generate(
     generator: torch.Generator,
     fast: bool = True,
     at_once: int | None = None,
+    running: AbstractContextManager[None] = ALONE,
 ) -> Generation:
     """Draw K responses to each of P prompts (token ids). Raises `ValueError` while the model is in training mode.
 
     `fast` allows the decoder that is written out, which agrees with the general one to rounding. `at_once`: the most
     rows in a batch, but for the K of one prompt; where rows end, those of the next prompts take their places.
+    `running`: what surrounds the passes of this rank.
     """
     if model.training:
         raise ValueError("generation wants the model in eval mode: dropout would falsify its log-probabilities")
@@ -133,10 +138,11 @@ def generate(
     # which rank it is on.
     uniform = torch.rand(shape, generator=generator)[world().mine].flatten(0, 1).to(model.device)
     mine = prompts[world().mine]
-    if mine or world().size == 1:
-        drawn = _decode(_Opener(model, mine, sampling, fast), uniform, at_once)
-    else:
-        drawn = _nothing(uniform)
+    with running:
+        if mine or world().size == 1:
+            drawn = _decode(_Opener(model, mine, sampling, fast), uniform, at_once)
+        else:
+            drawn = _nothing(uniform)
     if world().size == 1:
         return drawn
     found = [getattr(drawn, one.name).unflatten(0, (-1, sampling.samples)) for one in fields(Generation)]

@@ -7,24 +7,28 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 from transformers import GenerationConfig, PreTrainedModel
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
+from prefrl.distributed import joined, world
 from prefrl.policies.exact import check_exact
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.logprobs import all_logp, response_logp, shortcuts_of
+from prefrl.policies.logprobs import Shortcuts, all_logp, response_logp, shortcuts_of
 from prefrl.policies.pretrained import context_of, quiet
 from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator, to_numpy
 from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
+
+if TYPE_CHECKING:
+    from prefrl.policies.spread import Spread
 
 DIGESTED = 1000
 """About this many numbers of each matrix are enough to tell models apart."""
@@ -44,6 +48,15 @@ class LanguageSettings(Settings):
     at_once: int = Field(256, ge=1)
     """The most responses that are written at the same time (but never fewer than one prompt's): as some end, others are
     begun. Changes memory and speed, and nothing else but rounding."""
+    shard: Literal["none", "fsdp2"] = "none"
+    """What each of several ranks keeps: the whole model, or a share of every weight (`fsdp2`), for models that do not
+    fit; that is slower."""
+
+    @model_validator(mode="after")
+    def _room_for_all(self) -> LanguageSettings:
+        if self.shard != "none" and self.chunk < 4:
+            raise ValueError(f"shard={self.shard} wants a chunk of at least 4, got {self.chunk}")  # for equal parts
+        return self
 
 
 @contextmanager
@@ -57,6 +70,28 @@ def enough_memory(setting: str, value: int) -> Iterator[None]:
         raise MemoryError(
             f"memory ran out: halve {setting}, which is {value}; learner.policy.train=lora needs less throughout"
         ) from error
+
+
+class Whole:
+    """How each rank keeps its models: whole."""
+
+    fast = True
+
+    def place(self, model: PreTrainedModel, device: torch.device) -> None:
+        """Move a model to a device."""
+        model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
+
+    def running(self, model: PreTrainedModel) -> AbstractContextManager[None]:
+        """Meanwhile a model is run, without gradients."""
+        return nullcontext()
+
+    def whole(self, value: Tensor) -> Tensor:
+        """A copy of a parameter, or of what belongs to it."""
+        return value.clone()
+
+    def share(self, value: Tensor, of: Tensor) -> Tensor:
+        """This rank's share of a whole tensor."""
+        return value
 
 
 class LanguagePolicy:
@@ -73,25 +108,41 @@ class LanguagePolicy:
     ) -> None:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
         self._at_once = settings.at_once
+        self.keeping = _keeping(settings)
+        self._start_digest = ""
         self.model = task.model(frozen=settings.train == "lora")
-        self._shortcuts = shortcuts_of(self.model)
+        self._shortcuts = shortcuts_of(self.model) if self.keeping.fast else Shortcuts()
         check_exact(self.model, self._probe)
         if settings.train == "full":
             self.start = task.model(frozen=True)
-            return
-        from prefrl.policies.lora import add_adapters  # peft takes seconds to load
+        else:
+            from prefrl.policies.lora import add_adapters  # peft takes seconds to load
 
-        add_adapters(self.model, settings.lora_rank, settings.lora_targets, rng, "learner.policy")
-        self.start = self.model
+            add_adapters(self.model, settings.lora_rank, settings.lora_targets, rng, "learner.policy")
+            self.start = self.model
 
     @property
     def device(self) -> torch.device:
         return self.model.device
 
+    @property
+    def spread(self) -> bool:
+        """Whether each of several ranks keeps a share of every weight alone."""
+        return not isinstance(self.keeping, Whole)
+
+    def check_share(self, rows: int) -> None:
+        """Raises `ConfigError` where a gradient step on so many rows leaves a rank without any that has to have one."""
+        if self.spread and rows < world().size:
+            raise ConfigError(
+                f"learner.policy.shard=fsdp2: a gradient step on {rows} rows is too small for {world().size} ranks; "
+                "expected at least one for each: make learner's batches larger, or start fewer ranks"
+            )
+
     def to(self, device: torch.device) -> None:
-        """Move both models to a device."""
-        for model in (self.model, self.start):
-            model.to(device)  # type: ignore[arg-type]  # transformers wraps torch's method
+        """Move both models to a device, for good."""
+        self._start_digest = self.start_digest() if self.spread else ""  # while the weights are here
+        for model in (self.model, self.start) if self.start is not self.model else (self.model,):
+            self.keeping.place(model, device)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         return list(self._trained().values())
@@ -112,8 +163,9 @@ class LanguagePolicy:
         """
         encoded = [self.opened(prompt) for prompt in prompts]
         sampling = sampling or self.sampling(samples)
+        running, fast = self.keeping.running(self.model), self.keeping.fast
         with enough_memory("learner.policy.at_once", self._at_once):
-            drawn = generate(self.model, encoded, sampling, generator(rng), at_once=self._at_once)
+            drawn = generate(self.model, encoded, sampling, generator(rng), fast, self._at_once, running)
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)
@@ -135,7 +187,7 @@ class LanguagePolicy:
         self._check_room(int(responses.lengths().max()))
         temperature = self.temperature if temperature is None else temperature
         with self._at_the_start(), enough_memory("learner.policy.chunk", self.part):
-            return all_logp(self.start, responses, temperature, self.part, self._shortcuts)
+            return self._all_logp(self.start, responses, temperature)
 
     @torch.no_grad()
     def logp_at(self, values: State, responses: Responses) -> Tensor:
@@ -143,7 +195,7 @@ class LanguagePolicy:
         own = self.state()
         self.load(values)
         try:
-            return all_logp(self.model, responses, self.temperature, self.part, self._shortcuts)
+            return self._all_logp(self.model, responses, self.temperature)
         finally:
             self.load(own)
 
@@ -155,6 +207,8 @@ class LanguagePolicy:
 
     def start_digest(self) -> str:
         """sha256 over names and samples of the starting policy's weights, in the precision that all runs have."""
+        if self._start_digest:
+            return self._start_digest
         found = hashlib.sha256()
         for name, value in self.start.named_parameters():
             if "lora_" not in name:
@@ -169,7 +223,7 @@ class LanguagePolicy:
 
     def state(self) -> State:
         """What learning changes."""
-        return {name: p.detach().clone() for name, p in self._trained().items()}
+        return {name: self.keeping.whole(p.detach()) for name, p in self._trained().items()}
 
     @torch.no_grad()
     def load(self, state: State) -> None:
@@ -178,7 +232,8 @@ class LanguagePolicy:
             found = state.get(name)
             if found is None or found.shape != parameter.shape:
                 raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
-            parameter.copy_(found)  # in place: the optimiser holds these very tensors
+            # In place: the optimiser holds these very tensors.
+            parameter.copy_(self.keeping.share(found, parameter))
 
     def _check_room(self, tokens: int) -> None:
         context = context_of(self.model)
@@ -192,6 +247,10 @@ class LanguagePolicy:
         """By name. Tied weights have one name here."""
         return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
 
+    def _all_logp(self, model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
+        running = self.keeping.running(model)
+        return all_logp(model, responses, temperature, self.part, self._shortcuts, running)
+
     def _at_the_start(self) -> AbstractContextManager[None]:
         if self.start is not self.model:
             return nullcontext()
@@ -202,6 +261,14 @@ class LanguagePolicy:
     def _probe(self, prompts: Sequence[Sequence[int]], tokens: Tensor, mask: Tensor) -> Tensor:
         rows = Responses(("",) * len(prompts), tuple(map(tuple, prompts)), tokens, mask, mask.float(), mask[:, -1])
         return response_logp(self.model, rows, 1.0, self._shortcuts)
+
+
+def _keeping(settings: LanguageSettings) -> Whole | Spread:
+    if settings.shard == "none" or joined().size == 1:
+        return Whole()
+    from prefrl.policies.spread import Spread  # torch takes a second to load it
+
+    return Spread()
 
 
 def save_model(model: PreTrainedModel, task: TextTask, folder: Path, adapter: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from transformers import DynamicCache, PreTrainedModel
 
 from prefrl.distributed import world
 from prefrl.policies.exact import rows_of_embedding
-from prefrl.policies.generate import tempered
+from prefrl.policies.generate import ALONE, tempered
 from prefrl.policies.pretrained import window_of
 from prefrl.policies.responses import Responses, pad_right
 
@@ -64,15 +65,24 @@ def response_logp(
 
 @torch.no_grad()
 def all_logp(
-    model: PreTrainedModel, responses: Responses, temperature: float, part: int, shortcuts: Shortcuts
+    model: PreTrainedModel,
+    responses: Responses,
+    temperature: float,
+    part: int,
+    shortcuts: Shortcuts,
+    running: AbstractContextManager[None] = ALONE,
 ) -> Tensor:
-    """`response_logp` without gradients, a part of the rows at a time; ranks share the rows."""
+    """`response_logp` without gradients, a part of the rows at a time; ranks share the rows.
+
+    `running`: what surrounds the passes of this rank.
+    """
     found = torch.zeros(responses.mask.shape, device=responses.mask.device)[world().mine]
-    if len(found):
-        mine = responses if world().size == 1 else responses.rows(torch.arange(len(responses))[world().mine])
-        for at, rows in mine.parts(part):
-            # a part is cut to its longest row
-            found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, shortcuts)
+    with running:
+        if len(found):
+            mine = responses if world().size == 1 else responses.rows(torch.arange(len(responses))[world().mine])
+            for at, rows in mine.parts(part):
+                # a part is cut to its longest row
+                found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, shortcuts)
     return world().whole(found, len(responses))
 
 
