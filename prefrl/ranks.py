@@ -158,12 +158,11 @@ def rounds(loop: Loop[C]) -> Iterator[Round[C]]:
 
 def _align(loop: Loop[C]) -> None:
     """Stand where rank 0 stands."""
-    round, sequence, learner, reward = world().first(
-        # Not from GPU to GPU: each rank would have a copy on that of rank 0.
-        lambda: (loop.round, loop.sequence, *each_tensor([loop.learner.state(), loop.reward.state()], to_host))
-    )
+    # Not from GPU to GPU: each rank would have a copy on that of rank 0.
+    learner, reward = world().first(lambda: each_tensor([loop.learner.state(), loop.reward.state()], to_host))
+    counts = world().first(lambda: (loop.round, loop.sequence))
     if world().rank:
-        loop.round, loop.sequence = round, sequence
+        loop.round, loop.sequence = counts
         loop.learner.load(learner)
         loop.reward.load(reward)
 
