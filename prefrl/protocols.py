@@ -369,6 +369,9 @@ class Policy(Protocol[I_contra]):
     def values(self, inputs: I_contra) -> torch.Tensor:
         """(B, L) what the critic expects from each step on. Raises `ValueError` where there is no critic."""
 
+    def log_prob_and_values(self, inputs: I_contra) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]:
+        """Both, in one pass where the critic shares the network."""
+
 
 @runtime_checkable
 class LearnerSettings(Protocol):

@@ -97,6 +97,7 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "rloo, without rows for some": BATCH | {"prompts": 1},
     "rloo with adapters": BATCH | {"policy": {"train": "lora", "lora_rank": 4}},
     "grpo": BATCH | {"algorithm": "grpo", "epochs": 2, "minibatches": 2},
+    "ppo": BATCH | {"algorithm": "ppo", "prompts": 8, "responses": 1, "epochs": 2},
     "reinforce": BATCH | {"algorithm": "reinforce", "prompts": 5, "responses": 1},
 }
 

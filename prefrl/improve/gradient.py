@@ -44,6 +44,8 @@ class Objective:
     """False: the critic alone learns."""
     value: float = 0.0
     """Weight of the critic's loss."""
+    value_clip: float | None = None
+    """How far a value may go from the batch's before its loss no longer falls; None for the plain loss."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     reduction: Reduction = "token"
@@ -64,6 +66,8 @@ class Batch(Generic[I]):
     """(B, L), or (B, 1) where all steps of a sequence have the same."""
     returns: Tensor | None = None
     """(B, L) the critic's targets."""
+    values: Tensor | None = None
+    """(B, L) what the critic expected when the batch was drawn."""
 
     def __len__(self) -> int:
         return len(self.logp)
@@ -77,7 +81,7 @@ class Batch(Generic[I]):
             return None if steps is None else steps[at, :width]
 
         advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
-        return Batch(inputs, logp, advantages, cut(self.returns))
+        return Batch(inputs, logp, advantages, cut(self.returns), cut(self.values))
 
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
         """This rank's sequences, at most `size` at a time, those together that are like each other; all at once for
@@ -191,15 +195,15 @@ def _losses(
     """The loss of a part of a minibatch that has so many rows and steps, and the terms that it is made of."""
     mask = batch.inputs.mask
     if not objective.policy:
-        loss = _value(policy, batch, objective) / steps
+        loss = _value(policy.values(batch.inputs), batch, objective) / steps
         return loss, {"value_loss": loss.detach()}
-    logp, entropies = policy.log_prob(batch.inputs)
+    logp, entropies, values = _outputs(policy, batch.inputs, bool(objective.value))
     ratios = log_ratio(logp, batch.logp, mask)
     gain = _gain(logp, ratios, batch, objective)
     loss = policy_loss = reduce(gain, mask, objective.reduction, rows, steps)
     seen = {"policy_loss": policy_loss.detach()}
-    if objective.value:
-        value = _value(policy, batch, objective) / steps
+    if values is not None:
+        value = _value(values, batch, objective) / steps
         loss, seen["value_loss"] = loss + objective.value * value, value.detach()
     if entropies is not None:
         entropy = masked_sum(entropies, mask) / steps
@@ -216,10 +220,20 @@ def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -
     return gain
 
 
-def _value(policy: Policy[I], batch: Batch[I], objective: Objective) -> Tensor:
+def _outputs(policy: Policy[I], inputs: I, critic: bool) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Log-probabilities, entropies where they come cheap, and values where they are wanted."""
+    return policy.log_prob_and_values(inputs) if critic else (*policy.log_prob(inputs), None)
+
+
+def _value(values: Tensor, batch: Batch[I], objective: Objective) -> Tensor:
     """The critic's loss, summed over steps."""
     assert batch.returns is not None
-    return masked_sum(value_loss(policy.values(batch.inputs), batch.returns), batch.inputs.mask)
+    loss = value_loss(values, batch.returns)
+    if objective.value_clip is not None:
+        assert batch.values is not None
+        near = batch.values + (values - batch.values).clamp(-objective.value_clip, objective.value_clip)
+        loss = torch.maximum(loss, value_loss(near, batch.returns))  # the pessimistic one, as of the policy
+    return masked_sum(loss, batch.inputs.mask)
 
 
 def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Tensor]:

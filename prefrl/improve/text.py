@@ -1,8 +1,10 @@
-"""Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE.
+"""Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE, PPO.
 
-Variant: one advantage a response, no critic; the KL of a response (k1, summed over its tokens) is taken off the reward
-before the baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the
-baseline too. GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction.
+Variant: one advantage a response; the KL of a response (k1, summed over its tokens) is taken off the reward before the
+baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the baseline too.
+GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction. PPO has one
+advantage a token, from a critic (Ziegler et al. 2019): the KL is taken off at each token, and the score comes with the
+last one.
 """
 
 from __future__ import annotations
@@ -27,13 +29,16 @@ from prefrl.improve.objectives import (
     all_equal,
     batch_centred,
     batch_scaled,
+    gae,
     group_normalised,
     kl_k1,
     kl_k3,
     leave_one_out,
     masked_mean,
+    masked_whiten,
     step_rewards,
 )
+from prefrl.improve.text_formula import text_formula
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
@@ -45,19 +50,37 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "rloo": {},
     "grpo": {"advantage": "group_normalised", "clip": 0.2, "kl_in": "advantage", "reduction": "sequence"},
     "reinforce": {"advantage": "batch_mean"},
+    "ppo": {"advantage": "gae", "clip": 0.2, "reduction": "token", "prompts": 128, "responses": 1, "epochs": 4},
 }
 """Where their defaults are others than those of the fields below."""
 RATIO_TOLERANCE = {torch.float32: 0.01, torch.bfloat16: 1.0, torch.float16: 0.3}
 """In half precision a decoding step rounds otherwise than a pass over all tokens."""
 
 
+class CriticSettings(Settings):
+    """What a value is expected from, and how it is learned."""
+
+    network: Literal["shared", "own"] = "shared"
+    """Whose hidden states the value is a linear function of: the policy's, which then learn from both losses, or those
+    of a network that starts as a copy of the policy."""
+    weight: float = Field(0.1, gt=0)
+    """Of the critic's loss beside the policy's."""
+    clip: float | None = Field(None, gt=0)
+    """How far a value may go in a batch before its loss no longer falls; null for the plain squared error."""
+    trace: float = Field(1.0, ge=0, le=1)
+    """GAE's lambda: 1 weighs whole returns, and is right whatever the critic has learned; 0 only the next token."""
+    whiten: bool = True
+    """Scale the batch's advantages to mean 0 and variance 1."""
+
+
 class TextLearnerSettings(Settings):
     """Policy gradients on a learned reward, held near the starting policy by a KL penalty; RLOO by default."""
 
     kind: Literal["text"] = "text"
-    algorithm: Literal["rloo", "grpo", "reinforce"] = "rloo"
-    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with another KL, see below), or
-    reinforce (Williams 1992) with the batch's mean as its baseline. Anything that is set beside it stands."""
+    algorithm: Literal["rloo", "grpo", "reinforce", "ppo"] = "rloo"
+    """What fills in the defaults: rloo (Ahmadian et al. 2024), grpo (Shao et al. 2024, with another KL, see below),
+    reinforce (Williams 1992) with the batch's mean as its baseline, or ppo (Ziegler et al. 2019) with a critic.
+    Anything that is set beside it stands."""
     updates: int = Field(15, ge=1)
     """Batches of a round."""
     prompts: int = Field(16, ge=1)
@@ -68,9 +91,11 @@ class TextLearnerSettings(Settings):
     """Passes over each batch."""
     minibatches: int = Field(1, ge=1)
     """Gradient steps of a pass."""
-    advantage: Literal["leave_one_out", "group_normalised", "batch_scaled", "batch_mean"] = "leave_one_out"
+    advantage: Literal["leave_one_out", "group_normalised", "batch_scaled", "batch_mean", "gae"] = "leave_one_out"
     """What is taken off a response's return: the mean of its prompt's others (RLOO), its group's mean, over the group's
-    std (GRPO) or the batch's, or the batch's mean (REINFORCE)."""
+    std (GRPO) or the batch's, or the batch's mean (REINFORCE); or of a token, what a critic expected (`gae`, PPO)."""
+    critic: CriticSettings = CriticSettings()
+    """Of advantage `gae`."""
     clip: float | None = Field(None, gt=0)
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
     beta: float = Field(0.3, ge=0)
@@ -121,7 +146,7 @@ class TextLearnerSettings(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> TextLearnerSettings:
-        if self.advantage != "batch_mean" and self.responses < 2:
+        if self.advantage not in ("batch_mean", "gae") and self.responses < 2:
             raise ValueError(f"advantage {self.advantage} needs at least 2 responses, got {self.responses}")
         if self.clip is None and self.epochs * self.minibatches > 1:
             raise ValueError("several gradient steps on a batch (epochs x minibatches > 1) need a clip: set clip=0.2")
@@ -133,6 +158,8 @@ class TextLearnerSettings(Settings):
             raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=0")
         if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
             raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
+        if self.advantage == "gae" and self.kl_in != "reward":
+            raise ValueError("advantage gae takes the KL off token by token, as a reward: set kl_in=reward")
         if self.kl_target is not None and self.beta == 0:
             raise ValueError("kl_target steers beta, so beta must start above 0")
         return self
@@ -167,7 +194,8 @@ class TextLearner:
 
     def __init__(self, settings: TextLearnerSettings, task: TextTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
-        self._writer = Writer(task, settings, rng, settings.temperature)
+        network = settings.critic.network if settings.advantage == "gae" else None
+        self._writer = Writer(task, settings, rng, settings.temperature, network)
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0
@@ -229,13 +257,7 @@ class TextLearner:
         scores = self._finite("reward", self._shaped(raw, drawn))  # NaN: what was not scored teaches nothing
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
-        in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
-        # (B,): one return a response, so the KL is in it before the baseline is taken off.
-        returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
-        groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
-        kls = torch.where(scores.isnan(), math.nan, kl.sum(1)).view_as(groups)
-        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
-        batch = Batch(drawn, drawn.logp, advantages.view(-1, 1))  # (B, 1): the same for all tokens
+        batch, explained = (self._by_token if settings.advantage == "gae" else self._by_response)(drawn, scores, kl)
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         with enough_memory("learner.policy.chunk", settings.policy.chunk):
             steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
@@ -250,12 +272,45 @@ class TextLearner:
             "reward_std": float(raw[known].std(correction=0)) if known.any() else math.nan,
             "unscored": float(scores.isnan().float().mean()),
             **(self._distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
+            **explained,
             "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
             "length": float(drawn.mask.sum(1).float().mean()),
             "ended": float(drawn.ended.float().mean()),
             "beta": self._kl.beta,
-            "equal_groups": float(all_equal(scores.view_as(groups)).float().mean()),
+            **self._equal_groups(scores),
         }
+
+    def _by_response(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
+        """The same advantage for all tokens of a response, from scores (B,) and the KL of each token (B, L)."""
+        settings = self._settings
+        in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
+        # (B,): one return a response, so the KL is in it before the baseline is taken off.
+        returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
+        groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
+        kls = torch.where(scores.isnan(), math.nan, kl.sum(1)).view_as(groups)
+        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
+        return Batch(drawn, drawn.logp, advantages.view(-1, 1)), {}
+
+    def _by_token(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
+        """An advantage for each token, by the critic, and what share of the returns' variance that explains."""
+        how, mask = self._settings.critic, drawn.mask
+        values = self.policy.all_values(drawn)  # (B, L)
+        rewards = step_rewards(scores.nan_to_num(), kl, mask, self._kl.beta)
+        following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)  # 0 after the last token
+        # A response that was cut is over as well: its score is for what is there.
+        ends = mask & ~torch.cat([mask[:, 1:], torch.zeros_like(mask[:, :1])], 1)
+        advantages = gae(rewards, values, following, ends, 1.0, how.trace)
+        known = mask & ~scores.isnan()[:, None]
+        advantages = torch.where(known, advantages, 0.0)  # where nothing was scored the critic is held where it is
+        returns = values + advantages
+        left = masked_mean(advantages**2, known) / masked_mean((returns - masked_mean(returns, known)) ** 2, known)
+        white = masked_whiten(advantages, known) if how.whiten else advantages
+        return Batch(drawn, drawn.logp, white, returns, values), {"explained": 1.0 - float(left)}
+
+    def _equal_groups(self, scores: Tensor) -> Metrics:
+        """The share of prompts whose responses all have the same score, where there are several."""
+        groups = scores.view(-1, self._settings.responses)
+        return {"equal_groups": float(all_equal(groups).float().mean())} if groups.shape[1] > 1 else {}
 
     def _check_ratio(self, error: float) -> None:
         """Before a batch's first step the policy is the one that drew it: anything but rounding is a bug."""
@@ -267,8 +322,11 @@ class TextLearner:
 
     def _objective(self) -> Objective:
         """What a gradient step minimises."""
-        settings = self._settings
-        return Objective(clip=settings.clip, reduction=settings.reduction, max_grad_norm=settings.max_grad_norm)
+        settings, critic = self._settings, self._settings.critic
+        objective = Objective(clip=settings.clip, reduction=settings.reduction, max_grad_norm=settings.max_grad_norm)
+        if settings.advantage != "gae":
+            return objective
+        return replace(objective, value=critic.weight, value_clip=critic.clip)
 
     def _kl_advantages(self, kls: Tensor) -> Tensor | float:
         """(P, K): what the KL of each response takes off its advantage, where it is not in the reward.
@@ -340,48 +398,3 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
         return leave_one_out(returns)
     scaled = {"group_normalised": group_normalised, "batch_scaled": batch_scaled, "batch_mean": batch_centred}
     return scaled[how](returns)
-
-
-AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
-ADVANTAGES = {
-    "leave_one_out": "R_i - mean of the prompt's other R_j",
-    "group_normalised": "(R_i - mean of the prompt's R_j) / (their std + 1e-4)",
-    "batch_scaled": "(R_i - mean of the prompt's R_j) / (std of the batch's R + 1e-4)",
-    "batch_mean": "R_i - mean of the batch's R_j",
-}
-
-
-def text_formula(settings: TextLearnerSettings) -> str:
-    """The objective in plain letters, with the settings' numbers."""
-    gain = "log pi(y_t) A_i"
-    if settings.clip is not None:
-        gain = f"min(r A_i, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) A_i)"
-    kl = f"{settings.beta:g}" + (f" (steered to {settings.kl_target:g} nats)" if settings.kl_target else "")
-    apart = "sum_t [log pi_old(y_t) - log ref(y_t)]"
-    others = "the batch's" if settings.advantage == "batch_mean" else "the prompt's other"
-    beside = f" - {kl} (K_i - mean of {others} K_j),  K_i = {apart}"
-    after = beside if settings.beta and settings.kl_in == "advantage" else ""
-    in_reward = f" - {kl} {apart}" if settings.beta and not after else ""
-    lines = [
-        f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
-        *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
-        *([_moves(settings)] if settings.reference_every and settings.beta else []),
-        f"A_i = {ADVANTAGES[settings.advantage]}{after}",
-        f"R_i = {_score(settings)}{in_reward}",
-        f"{settings.prompts} prompts x {settings.responses} responses a batch, "
-        f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",
-    ]
-    return "\n".join(lines)
-
-
-def _moves(settings: TextLearnerSettings) -> str:
-    mix = settings.reference_mix
-    return f"ref <- {1 - mix:.2g} ref + {mix:g} pi after each {settings.reference_every} updates"
-
-
-def _score(settings: TextLearnerSettings) -> str:
-    """What is learned from of a response's score."""
-    score = "score(y_i)" if settings.reward_clip is None else f"clip(score(y_i), +-{settings.reward_clip:g})"
-    cost = f" - {settings.length_cost:g} tokens(y_i)" if settings.length_cost else ""
-    end = "" if settings.drop_unended else f" - {settings.missing_end_penalty:g} [no end token]"
-    return score + end + cost + (", of responses with an end token alone" if settings.drop_unended else "")

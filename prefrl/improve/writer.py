@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -42,10 +42,18 @@ class Writer:
     """A policy with its optimiser, and how many tokens it wrote for what."""
 
     def __init__(
-        self, task: TextTask, settings: WriterSettings, rng: np.random.Generator, temperature: float = 1.0
+        self,
+        task: TextTask,
+        settings: WriterSettings,
+        rng: np.random.Generator,
+        temperature: float = 1.0,
+        critic: Literal["shared", "own"] | None = None,
     ) -> None:
-        """`temperature`: of sampling, and of every log-probability in the objective."""
+        """`temperature`: of sampling, and of every log-probability in the objective; `critic`: whose hidden states it
+        reads, where there is one."""
         self.policy = LanguagePolicy(task, temperature, settings.policy, rng)
+        if critic is not None:
+            self.policy.add_critic(own=critic == "own")
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self.steps = Steps()
         self._gathered = self._gather() if self.policy.spread else {}

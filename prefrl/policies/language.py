@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import torch
@@ -19,7 +19,15 @@ from prefrl.components import ConfigError, Settings
 from prefrl.distributed import joined, world
 from prefrl.policies.exact import check_exact
 from prefrl.policies.generate import Sampling, generate
-from prefrl.policies.logprobs import Shortcuts, all_logp, response_logp, shortcuts_of
+from prefrl.policies.logprobs import (
+    Shortcuts,
+    all_logp,
+    in_all_rows,
+    logp_of_states,
+    response_logp,
+    response_states,
+    shortcuts_of,
+)
 from prefrl.policies.pretrained import context_of, quiet
 from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
@@ -28,6 +36,7 @@ from prefrl.storage.files import whole_folder
 from prefrl.types import Response, State
 
 if TYPE_CHECKING:
+    from prefrl.policies.critic import Critic
     from prefrl.policies.spread import Spread
 
 DIGESTED = 1000
@@ -109,6 +118,7 @@ class LanguagePolicy:
         self.task, self.temperature, self.part = task, temperature, settings.chunk
         self._at_once = settings.at_once
         self.keeping = _keeping(settings)
+        self.critic: Critic | None = None
         self._start_digest = ""
         self.model = task.model(frozen=settings.train == "lora")
         self._shortcuts = shortcuts_of(self.model) if self.keeping.fast else Shortcuts()
@@ -139,10 +149,12 @@ class LanguagePolicy:
             )
 
     def to(self, device: torch.device) -> None:
-        """Move both models to a device, for good."""
+        """Move everything to a device, for good."""
         self._start_digest = self.start_digest() if self.spread else ""  # while the weights are here
         for model in (self.model, self.start) if self.start is not self.model else (self.model,):
             self.keeping.place(model, device)
+        if self.critic is not None:
+            self.critic.to(device)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         return list(self._trained().values())
@@ -152,7 +164,32 @@ class LanguagePolicy:
             return response_logp(self.model, inputs, self.temperature, self._shortcuts), None
 
     def values(self, inputs: Responses) -> Tensor:
-        raise ValueError("a language model without a critic has no values: set the weight of the critic's loss to 0")
+        with enough_memory("learner.policy.chunk", self.part):
+            found: Tensor = self._critic()(self.model, inputs)
+        return found
+
+    def log_prob_and_values(self, inputs: Responses) -> tuple[Tensor, None, Tensor]:
+        critic = self._critic()
+        if critic.trunk is not None or not self._shortcuts.head_alone:
+            return *self.log_prob(inputs), self.values(inputs)
+        with enough_memory("learner.policy.chunk", self.part):
+            states = response_states(self.model, inputs, self._shortcuts)
+            logp = logp_of_states(self.model, states, inputs, self.temperature)
+            return logp, None, critic.of_states(states, inputs.mask)
+
+    def all_values(self, responses: Responses) -> Tensor:
+        """(B, L) values, without gradients."""
+        return in_all_rows(self.values, responses, self.part)
+
+    def add_critic(self, own: bool) -> None:
+        """Let it learn values as well: from its own hidden states, or with a network that starts as a copy of it."""
+        from prefrl.policies.critic import Critic
+
+        if self.spread:
+            raise ConfigError("a critic is kept whole: with learner.policy.shard set choose an algorithm without one")
+        trunk = cast("PreTrainedModel", self.task.model().base_model) if own else None
+        width = self.model.get_output_embeddings().weight.shape[1]  # type: ignore[no-untyped-call]
+        self.critic = Critic(width, trunk, self._shortcuts)
 
     def respond(
         self, prompts: Sequence[str], samples: int, rng: np.random.Generator, sampling: Sampling | None = None
@@ -245,7 +282,13 @@ class LanguagePolicy:
 
     def _trained(self) -> dict[str, torch.nn.Parameter]:
         """By name. Tied weights have one name here."""
-        return {name: p for name, p in self.model.named_parameters() if p.requires_grad}
+        critic = self.critic.named_parameters(prefix="critic") if self.critic else ()
+        return {name: p for name, p in (*self.model.named_parameters(), *critic) if p.requires_grad}
+
+    def _critic(self) -> Critic:
+        if self.critic is None:
+            raise ValueError("a language model without a critic has no values: set the weight of its loss to 0")
+        return self.critic
 
     def _all_logp(self, model: PreTrainedModel, responses: Responses, temperature: float) -> Tensor:
         running = self.keeping.running(model)

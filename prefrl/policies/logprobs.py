@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -53,17 +54,25 @@ def response_logp(
     model: PreTrainedModel, responses: Responses, temperature: float, shortcuts: Shortcuts = Shortcuts(head_alone=True)
 ) -> Tensor:
     """(B, L) float32 log-probabilities of the responses' tokens, differentiable; 0 on padding."""
-    mask = responses.mask
+    if shortcuts.head_alone:
+        return logp_of_states(model, response_states(model, responses, shortcuts), responses, temperature)
+    return _logp_of_logits(_logits(model, responses), responses, temperature)
+
+
+def response_states(model: PreTrainedModel, responses: Responses, shortcuts: Shortcuts) -> Tensor:
+    """(n, d) hidden states that predict the n real tokens, row by row, differentiable."""
     if shortcuts.prompts_once and responses.repeat_prompts and _within_window(model, responses):
-        logits = head_logits(model, _states_from_shared_prompts(model, responses))
-    else:
-        logits = _logits(model, responses, shortcuts.head_alone)
-    # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
-    found = -cross_entropy(tempered(logits, temperature), responses.tokens[mask], reduction="none")
-    return found.new_zeros(mask.shape).masked_scatter(mask, found)  # (n,) -> (B, L), row by row
+        return _states_from_shared_prompts(model, responses)
+    ids, rows, columns = _rows_with_prompts(responses)
+    hidden: Tensor = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
+    return hidden[rows, columns]
 
 
-@torch.no_grad()
+def logp_of_states(model: PreTrainedModel, states: Tensor, responses: Responses, temperature: float) -> Tensor:
+    """`response_logp` from `response_states`, of a model whose logits are its head's output."""
+    return _logp_of_logits(head_logits(model, states), responses, temperature)
+
+
 def all_logp(
     model: PreTrainedModel,
     responses: Responses,
@@ -76,18 +85,45 @@ def all_logp(
 
     `running`: what surrounds the passes of this rank.
     """
+    return in_all_rows(lambda rows: response_logp(model, rows, temperature, shortcuts), responses, part, running)
+
+
+@torch.no_grad()
+def in_all_rows(
+    compute: Callable[[Responses], Tensor],
+    responses: Responses,
+    part: int,
+    running: AbstractContextManager[None] = ALONE,
+) -> Tensor:
+    """(B, L) of what is computed for (b, l) tokens, without gradients, a part of the rows at a time; ranks share the
+    rows."""
     found = torch.zeros(responses.mask.shape, device=responses.mask.device)[world().mine]
     with running:
         if len(found):
             mine = responses if world().size == 1 else responses.rows(torch.arange(len(responses))[world().mine])
             for at, rows in mine.parts(part):
                 # a part is cut to its longest row
-                found[at, : rows.mask.shape[1]] = response_logp(model, rows, temperature, shortcuts)
+                found[at, : rows.mask.shape[1]] = compute(rows)
     return world().whole(found, len(responses))
 
 
-def _logits(model: PreTrainedModel, responses: Responses, head_alone: bool) -> Tensor:
-    """(n, V) logits of the n real tokens, row by row, each row run with its own prompt.
+def _logp_of_logits(logits: Tensor, responses: Responses, temperature: float) -> Tensor:
+    mask = responses.mask
+    # At the temperature of sampling, or the ratio is not 1 before the first step; in float32, whatever the model is.
+    found = -cross_entropy(tempered(logits, temperature), responses.tokens[mask], reduction="none")
+    return found.new_zeros(mask.shape).masked_scatter(mask, found)  # (n,) -> (B, L), row by row
+
+
+def _logits(model: PreTrainedModel, responses: Responses) -> Tensor:
+    """(n, V) logits of the n real tokens, row by row."""
+    ids, rows, columns = _rows_with_prompts(responses)
+    first = int(columns.min())  # whose logits are wanted
+    kept: Tensor = model(input_ids=ids, use_cache=False, logits_to_keep=ids.shape[1] - first).logits
+    return kept[rows, columns - first]
+
+
+def _rows_with_prompts(responses: Responses) -> tuple[Tensor, Tensor, Tensor]:
+    """(B, T) tokens, each row with its own prompt, and the rows (n,) and columns (n,) of what predicts each real token.
 
     Rows are padded on the right, where a causal model never looks: no attention mask and no position ids are needed.
     """
@@ -97,12 +133,7 @@ def _logits(model: PreTrainedModel, responses: Responses, head_alone: bool) -> T
     ids = prompts.new_zeros(len(responses), int(places.max()) + 1)  # padded with 0, which is a valid id
     ids[:, : prompts.shape[1]] = prompts
     ids[rows, places] = responses.tokens[rows, steps]
-    if head_alone:
-        hidden = model.base_model(input_ids=ids, use_cache=False).last_hidden_state
-        return head_logits(model, hidden[rows, places - 1])  # the state before a token predicts it
-    first = int(lengths.min()) - 1  # the first column whose logits are wanted
-    kept: Tensor = model(input_ids=ids, use_cache=False, logits_to_keep=ids.shape[1] - first).logits
-    return kept[rows, places - 1 - first]
+    return ids, rows, places - 1  # the state before a token predicts it
 
 
 def _states_from_shared_prompts(model: PreTrainedModel, responses: Responses) -> Tensor:

@@ -170,6 +170,9 @@ class MLPPolicy:
         """(B, 1)."""
         return forward(self.critic, inputs.observations)
 
+    def log_prob_and_values(self, inputs: Decisions) -> tuple[Tensor, Tensor, Tensor]:
+        return *self.log_prob(inputs), self.values(inputs)
+
     def values_of(self, observations: Tensor) -> Tensor:
         """Normalised observations (..., O) -> (...)."""
         return forward(self.critic, observations).squeeze(-1)

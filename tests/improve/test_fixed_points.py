@@ -28,11 +28,14 @@ NO_STORE = cast("Store[Response]", None)
 BETA, LENGTH, END, VOCABULARY = 0.3, 3, 2, 6
 GOOD = 4
 """A response is worth 1 where it says this token, and has ended."""
+PPO: dict[str, Any] = {"algorithm": "ppo", "prompts": 256, "responses": 1, "epochs": 2}
 CLAIMING: dict[str, dict[str, Any]] = {
     "rloo": {},
     "reinforce": {"algorithm": "reinforce"},
     "rloo, KL off the advantage": {"kl_in": "advantage"},
     "clipped": {"clip": 0.2, "epochs": 2, "minibatches": 2},
+    "ppo": PPO,
+    "ppo, its critic a network of its own": PPO | {"critic": {"network": "own"}},
     "clipped, KL off the advantage": {"clip": 0.2, "epochs": 2, "minibatches": 2, "kl_in": "advantage"},
 }
 
@@ -150,7 +153,7 @@ def improved(task: TextTask, at: Mapping[str, Tensor] | None, updates: int, rate
     settings |= {"missing_end_penalty": 0.0, "learning_rate": rate} | changes
     one = TextLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
     if at is not None:
-        one.policy.load(dict(at))
+        one.policy.load(one.policy.state() | dict(at))
     one.improve(cast("RewardModel[Response]", Worth()), NO_STORE, np.random.default_rng(0))
     return one
 

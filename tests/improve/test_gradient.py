@@ -50,6 +50,9 @@ class Table:
     def values(self, inputs: Rows) -> Tensor:
         return self.critic[: inputs.chosen.shape[1]].expand(inputs.chosen.shape)
 
+    def log_prob_and_values(self, inputs: Rows) -> tuple[Tensor, Tensor, Tensor]:
+        return *self.log_prob(inputs), self.values(inputs)
+
 
 def batch_of(policy: Table, count: int = 6) -> Batch[Rows]:
     generator = torch.Generator().manual_seed(1)

@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
+from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of
+from prefrl.improve.text_formula import text_formula
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
@@ -68,6 +69,7 @@ VARIANTS: list[dict[str, object]] = [
         "beta": 0.1,
     },
     {"advantage": "batch_mean", "reduction": "token", "temperature": 0.8, "kl_target": 3.0},
+    {"algorithm": "ppo", "beta": 0.1, "critic": {"clip": 1.0}},
 ]
 
 
@@ -336,7 +338,7 @@ def test_the_kl_does_not_teach_by_what_was_not_scored(toy_reviews: Reviews) -> N
     assert torch.equal(torch.as_tensor(one._kl_advantages(kls)), torch.zeros(1, 4))
 
 
-@pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean"])
+@pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean", "gae"])
 def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
     """As if it had never been drawn: the others learn from one another alone."""
 
