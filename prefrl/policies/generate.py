@@ -240,7 +240,9 @@ def _decode(opener: _Opener, uniform: Tensor, at_once: int | None) -> Generation
         place = (most * samples - left) // samples  # for so many prompts
         refill = opener.waiting and place >= (1 - KEEP_SHARE) * most and going.decoder.joins
         more = opener.open(min(place, opener.waiting)) if refill else None
-        if left <= KEEP_SHARE * len(on) or more:
+        # Rows that have ended go on meanwhile, but to no place that a model may not have.
+        over = bool((going.at >= uniform.shape[1]).any())
+        if left <= KEEP_SHARE * len(on) or more or over:
             kept = on.nonzero()[:, 0]
             going.decoder.keep(kept)
             going.rows, going.at, drawn = going.rows[kept], going.at[kept], drawn[kept]

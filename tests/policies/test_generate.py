@@ -18,7 +18,7 @@ PROMPTS = [[1, 7, 8, 9, 10, 11], [1, 5], [1, 20, 21], [1]]
 ENDS = (2, 3, 4, 30, 31)
 
 
-def llama() -> PreTrainedModel:
+def llama(context: int = 64) -> PreTrainedModel:
     torch.manual_seed(0)  # two ways of computing agree on draws only where none is close
     config = LlamaConfig(
         vocab_size=V,
@@ -27,15 +27,15 @@ def llama() -> PreTrainedModel:
         num_hidden_layers=2,
         num_attention_heads=4,
         num_key_value_heads=2,
-        max_position_embeddings=64,
+        max_position_embeddings=context,
     )
     return _loud(LlamaForCausalLM(config))
 
 
-def gpt2() -> PreTrainedModel:
+def gpt2(context: int = 64) -> PreTrainedModel:
     """Absolute positions: what a model with left padding gets wrong without position ids."""
     torch.manual_seed(0)
-    return _loud(GPT2LMHeadModel(GPT2Config(vocab_size=V, n_embd=32, n_layer=2, n_head=4, n_positions=64)))
+    return _loud(GPT2LMHeadModel(GPT2Config(vocab_size=V, n_embd=32, n_layer=2, n_head=4, n_positions=context)))
 
 
 def _loud(model: PreTrainedModel) -> PreTrainedModel:
@@ -83,6 +83,18 @@ def test_no_more_rows_than_are_allowed_are_written_at_once(monkeypatch: pytest.M
     assert max(seen) <= 10
     assert len(seen) < 8 * 13  # eight blocks, one after the other, each as long as its longest row
     assert sum(seen[:20]) > 0.6 * 10 * 20
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("make", [lambda: llama(17), lambda: gpt2(17)])
+def test_rows_that_ended_long_ago_are_at_no_place_that_a_model_has_not(
+    make: Callable[[], PreTrainedModel], fast: bool
+) -> None:
+    model, sampling = make(), Sampling(8, 14, (2,))  # few end, and wait among those that go on and those that join
+    prompts = [[1, 5, 9]] * 24
+    whole = generate(model, prompts, sampling, torch.Generator().manual_seed(5), fast)
+    found = generate(model, prompts, sampling, torch.Generator().manual_seed(5), fast, at_once=32)
+    assert torch.equal(found.tokens, whole.tokens)
 
 
 def responses(found: Generation, samples: int, prompts: Sequence[Sequence[int]] = PROMPTS) -> Responses:
