@@ -81,6 +81,9 @@ TABLE: dict[Role, dict[str, str]] = {
     "learners": {
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",
+        "kto": "prefrl.improve.kto:KTOSettings",
+        "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
+        "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
         "text": "prefrl.improve.text:TextLearnerSettings",
     },

@@ -14,6 +14,7 @@ import numpy as np
 
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
+from prefrl.evaluate.best_of_n import best
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.grade import Subject, grade, habits, judgements, of_run
 from prefrl.evaluate.summary import read_metrics
@@ -22,7 +23,7 @@ from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
-from prefrl.protocols import Attended, Labeler, text
+from prefrl.protocols import Attended, Labeler, RewardModel, TextTask, text
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
@@ -205,13 +206,46 @@ def generate(
     policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int = 0, batch: int = 16
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Each prompt with a policy's responses, `batch` prompts at a time."""
+    for prompt, found in _answered(policy, texts, sampling, seed, batch):
+        yield prompt, tuple(one.text for one in found)
+
+
+def generate_best(
+    policy: LanguagePolicy,
+    reward: RewardModel[Response],
+    texts: Sequence[str],
+    sampling: Drawn,
+    seed: int = 0,
+    batch: int = 16,
+) -> Iterator[tuple[str, str, float | None]]:
+    """Each prompt with the response that a reward model scores highest, of those that `generate` gives, and its score.
+
+    What is not scored never wins; where nothing is, it is the first, and its score None.
+    """
+    for prompt, found in _answered(policy, texts, sampling, seed, batch):
+        scores = reward.score(found)
+        at = int(best(scores))
+        yield prompt, found[at].text, None if np.isnan(scores[at]) else float(scores[at])
+
+
+def reward_of(folder: Path, task: TextTask) -> RewardModel[Response]:
+    """The newest reward model of a run of text. Raises `RunError` where nothing was fitted yet."""
+    reward: RewardModel[Response] = open_saved(folder).reward(task)
+    if not reward.fitted:
+        raise RunError(f"{folder}: its reward model was not fitted yet, and cannot tell which response is the best")
+    return reward
+
+
+def _answered(
+    policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int, batch: int
+) -> Iterator[tuple[str, list[Response]]]:
     how = replace(policy.sampling(sampling.samples, sampling.temperature), top_k=sampling.top_k, top_p=sampling.top_p)
     for start in range(0, len(texts), batch):
         some = texts[start : start + batch]
         drawn = policy.respond(some, how.samples, np.random.default_rng([seed, start]), how)
-        found = [one.text for one in drawn.candidates(policy.task.tokenizer)]
+        found = drawn.candidates(policy.task.tokenizer)
         for i, prompt in enumerate(some):
-            yield prompt, tuple(found[i * how.samples : (i + 1) * how.samples])
+            yield prompt, found[i * how.samples : (i + 1) * how.samples]
 
 
 class Drawn(NamedTuple):

@@ -20,6 +20,9 @@ from prefrl.evaluate.policies import scored
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
 from prefrl.improve.dpo import DPOSettings
+from prefrl.improve.kto import KTOSettings
+from prefrl.improve.online_dpo import OnlineDPOSettings
+from prefrl.improve.raft import RAFTSettings
 from prefrl.improve.text import TextLearnerSettings
 from prefrl.judgements import Comparison, Judged
 from prefrl.protocols import RewardModel
@@ -111,9 +114,14 @@ def policies(cache: Path) -> Found:
         metrics = learner.improve(LIKES, None, np.random.default_rng(1))  # type: ignore[arg-type]
         found |= dict(learned(name, learner.policy.parameters()))
         found[f"{name}: metrics"] = torch.tensor([metrics[key] for key in sorted(metrics) if key != "ratio_error"])
-    direct = DPOSettings(minibatch=5, policy={"chunk": 4}).build(task, np.random.default_rng(0))
-    direct.improve(LIKES, Few(direct.sample(12, np.random.default_rng(2))), np.random.default_rng(3))  # type: ignore[arg-type]
-    found |= dict(learned("dpo", direct.policy.parameters()))
+    raft = RAFTSettings(updates=1, prompts=5, responses=2, minibatch=3, policy={"chunk": 2})
+    expert = raft.build(task, np.random.default_rng(0))
+    metrics = expert.improve(LIKES, None, np.random.default_rng(1))  # type: ignore[arg-type]
+    found |= dict(learned("raft", expert.policy.parameters()))
+    found["raft: metrics"] = torch.tensor([metrics[key] for key in sorted(metrics)])
+    for name in DIRECT:
+        direct, measured = fitted(task, name, 5, {"chunk": 4})
+        found |= dict(learned(name, direct.policy.parameters())) | measured
     evaluated = direct.evaluate(LIKES, np.random.default_rng(4)).metrics
     return found | {"evaluated": torch.tensor([evaluated[key] for key in sorted(evaluated)])}
 
@@ -142,9 +150,26 @@ def spread_out(cache: Path) -> Found:
         found[f"{name}: metrics"] = torch.tensor([metrics[key] for key in sorted(metrics) if key != "ratio_error"])
     drawn = learner.policy.respond(["The plot was"], 2, np.random.default_rng(3))  # not for all ranks
     found["one prompt"] = learner.policy.start_logp(drawn)
-    direct = DPOSettings(minibatch=6, policy={"chunk": 4, "shard": "fsdp2"}).build(task, np.random.default_rng(0))
-    direct.improve(LIKES, Few(direct.sample(12, np.random.default_rng(2))), np.random.default_rng(3))  # type: ignore[arg-type]
-    return found | saved("dpo", direct.state())
+    for name in DIRECT:
+        direct, measured = fitted(task, name, 6, {"chunk": 4, "shard": "fsdp2"})
+        found |= saved(name, direct.state()) | measured
+    return found
+
+
+DIRECT: dict[str, Callable[..., Any]] = {
+    "online": lambda minibatch, policy: OnlineDPOSettings(updates=1, prompts=9, responses=3, soft=True, policy=policy),
+    "kto": KTOSettings,
+    "dpo": DPOSettings,
+}
+
+
+def fitted(task: Any, name: str, minibatch: int, policy: dict[str, Any]) -> tuple[Any, Found]:
+    """A direct method's learner and metrics after one round."""
+    direct = DIRECT[name](minibatch=minibatch, policy=policy).build(task, np.random.default_rng(0))
+    store = Few(direct.sample(12, np.random.default_rng(2)))
+    metrics = direct.improve(LIKES, store, np.random.default_rng(3))
+    # At the start all gains are 0 but for rounding, which then decides who gained more.
+    return direct, {f"{name}: metrics": torch.tensor([metrics[key] for key in sorted(metrics) if key != "accuracy"])}
 
 
 def saved(name: str, state: State) -> Found:

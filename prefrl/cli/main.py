@@ -18,6 +18,8 @@ from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
+    from collections.abc import Iterator
+
     from prefrl.config import Config
 
 app = typer.Typer(
@@ -211,18 +213,30 @@ def generate(
     temperature: Annotated[float, typer.Option(help="0 takes the most probable token.", min=0)] = 1.0,
     top_k: Annotated[int, typer.Option(help="Draw among so many tokens; 0 for all.", min=0)] = 0,
     top_p: Annotated[float, typer.Option(help="Draw among tokens of this share.", min=0, max=1)] = 1.0,
+    best_of: Annotated[
+        int | None,
+        typer.Option(help="Of so many responses write the one that the run's reward model scores highest.", min=1),
+    ] = None,
 ) -> None:
     """Have the newest policy of a text run answer prompts; `prefrl label --given` reads what is written."""
     from prefrl import stages
     from prefrl.cli.console import counted, say
 
     _refuse(to.exists(), f"{to} is there already: choose another name with --to")
+    _refuse(bool(best_of) and samples > 1, "--best-of keeps one of N responses to each prompt: leave --samples out")
+    _refuse(bool(best_of) and temperature == 0, "--best-of wants responses that differ: raise --temperature above 0")
     policy = stages.policy_of(folder)
     texts = stages.prompts_for(policy, prompts)
-    drawn = stages.generate(policy, texts, stages.Drawn(samples, temperature, top_k, top_p))
-    for prompt, found in counted(drawn, len(texts), "prompts"):
+    how = stages.Drawn(best_of or samples, temperature, top_k, top_p)
+    rows: Iterator[dict[str, object]]
+    if best_of:
+        chosen = stages.generate_best(policy, stages.reward_of(folder, policy.task), texts, how)
+        rows = ({"prompt": prompt, "responses": [found], "scores": [score]} for prompt, found, score in chosen)
+    else:
+        rows = ({"prompt": prompt, "responses": found} for prompt, found in stages.generate(policy, texts, how))
+    for row in counted(rows, len(texts), "prompts"):
         with to.open("a", encoding="utf-8") as file:  # line by line: what was written stays, whatever comes
-            file.write(json.dumps({"prompt": prompt, "responses": found}, ensure_ascii=False) + "\n")
+            file.write(json.dumps(row, ensure_ascii=False) + "\n")
     say(f"{len(texts)} prompts answered in {to}")
 
 

@@ -90,6 +90,17 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
 # A score that is NaN was not given: it counts in no baseline, and what has it gets advantage 0.
 
 
+def win_rates(scores: Tensor) -> Tensor:
+    """(P, K) scores of K responses to each of P prompts -> the probability that each beats one of its prompt's.
+
+    Scores are those of Bradley and Terry: a beats b with probability s(score_a - score_b). A response ties with itself;
+    `leave_one_out` takes that out again, and leaves the win rate against the others minus a half.
+    """
+    apart = scores[:, :, None] - scores[:, None, :]  # (P, K, K)
+    won = torch.where(_known(apart), apart.sigmoid(), 0.0).sum(2) / _known(scores).sum(1, keepdim=True).clamp(min=1)
+    return torch.where(_known(scores), won, math.nan)
+
+
 def leave_one_out(scores: Tensor) -> Tensor:
     """(P, K) scores of K responses to each of P prompts, minus the mean of the other K - 1 (RLOO, Ahmadian 2024)."""
     if scores.shape[1] < 2:
@@ -171,15 +182,44 @@ def value_loss(values: Tensor, returns: Tensor) -> Tensor:
     return 0.5 * (values - returns) ** 2
 
 
-def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
-    """(M,) losses of pairs from beta x the difference of their log-ratios to the reference (M,).
+# --- Losses of preferences, one number a pair or a response -------------------------------------------------------
+# A response's gain is log pi(y|x) - log ref(y|x), and a pair's gap the first one's gain minus the second one's.
+# `preference` in [0, 1] is for the first of a pair, and `smoothing` the share of them that are taken to be wrong.
 
-    Rafailov et al. 2023, equation 7; `preference` (M,) in [0, 1] is for the first of a pair, and `smoothing` the share
-    of them that are taken to be wrong (cDPO, Mitchell 2023).
+
+def dpo_loss(margins: Tensor, preference: Tensor, smoothing: float) -> Tensor:
+    """(M,) losses of pairs from beta x their gaps (M,).
+
+    Rafailov et al. 2023, equation 7, with soft targets (cDPO, Mitchell 2023).
     """
-    right = preference * (1 - smoothing) + (1 - preference) * smoothing
+    right = _right(preference, smoothing)
     # log(1 - s(h)) as logsigmoid(-h): the other way it is log 0 for a large margin.
     return -(right * logsigmoid(margins) + (1 - right) * logsigmoid(-margins))
+
+
+def ipo_loss(gaps: Tensor, preference: Tensor, smoothing: float, beta: float) -> Tensor:
+    """(M,) squared distances of gaps (M,) from 1 / (2 beta), or from minus that where the second is better.
+
+    Azar et al. 2024, equation 17. A soft preference p is p times the one and 1 - p times the other: the expectation
+    over answers, which is least at a gap of (2p - 1) / (2 beta).
+    """
+    right, target = _right(preference, smoothing), 1 / (2 * beta)
+    return right * (gaps - target) ** 2 + (1 - right) * (gaps + target) ** 2
+
+
+def kto_loss(gains: Tensor, desirable: Tensor, point: Tensor, beta: float) -> Tensor:
+    """(B,) losses of single responses from their gains (B,): 1 minus how good each one's gain is felt to be.
+
+    Ethayarajh et al. 2024, equation 8, before its weights: s(beta (gain - point)) is the value of a response that is
+    `desirable` (B,), s(beta (point - gain)) that of another. No gradient passes through the reference point.
+    """
+    lead = gains - point.detach()
+    return torch.sigmoid(-beta * torch.where(desirable, lead, -lead))  # 1 - s(x) is s(-x)
+
+
+def _right(preference: Tensor, smoothing: float) -> Tensor:
+    """(M,) the probability that the first of a pair is better."""
+    return preference * (1 - smoothing) + (1 - preference) * smoothing
 
 
 # --- KL(pi || ref) from samples of pi ----------------------------------------------------------------------------

@@ -37,8 +37,8 @@ from prefrl.improve.objectives import (
     masked_mean,
     masked_whiten,
     step_rewards,
+    win_rates,
 )
-from prefrl.improve.text_formula import text_formula
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
@@ -128,6 +128,9 @@ class TextLearnerSettings(Settings):
     2025)."""
     length_cost: float = 0.0
     """Taken off the score for each token."""
+    score: Literal["raw", "win_rate"] = "raw"
+    """What is learned from: the score itself, or how probable the reward model finds it that a response beats another
+    one to its prompt (`win_rate`, 0 to 1), which is another objective: see docs."""
     reward_clip: float | None = Field(None, gt=0)
     """A score is cut to this size, before anything is taken off it."""
     asked_responses: int = Field(4, ge=2)
@@ -158,6 +161,8 @@ class TextLearnerSettings(Settings):
             raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=0")
         if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
             raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
+        if self.score == "win_rate" and (self.responses < 2 or self.advantage == "gae"):
+            raise ValueError("score win_rate compares a prompt's responses: it wants at least 2, and no critic")
         if self.advantage == "gae" and self.kl_in != "reward":
             raise ValueError("advantage gae takes the KL off token by token, as a reward: set kl_in=reward")
         if self.kl_target is not None and self.beta == 0:
@@ -255,6 +260,8 @@ class TextLearner:
         raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
         known = ~raw.isnan()
         scores = self._finite("reward", self._shaped(raw, drawn))  # NaN: what was not scored teaches nothing
+        if settings.score == "win_rate":
+            scores = win_rates(scores.view(-1, settings.responses)).flatten()
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         batch, explained = (self._by_token if settings.advantage == "gae" else self._by_response)(drawn, scores, kl)
@@ -398,3 +405,73 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
         return leave_one_out(returns)
     scaled = {"group_normalised": group_normalised, "batch_scaled": batch_scaled, "batch_mean": batch_centred}
     return scaled[how](returns)
+
+
+NETWORKS = {"shared": "the policy's hidden states", "own": "a network of its own"}
+AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
+ADVANTAGES = {
+    "leave_one_out": "R_i - mean of the prompt's other R_j",
+    "group_normalised": "(R_i - mean of the prompt's R_j) / (their std + 1e-4)",
+    "batch_scaled": "(R_i - mean of the prompt's R_j) / (std of the batch's R + 1e-4)",
+    "batch_mean": "R_i - mean of the batch's R_j",
+}
+"""Of a response."""
+
+
+def text_formula(settings: TextLearnerSettings) -> str:
+    """The objective in plain letters, with the settings' numbers."""
+    index = "A_t" if settings.advantage == "gae" else "A_i"
+    gain = f"log pi(y_t) {index}"
+    if settings.clip is not None:
+        gain = f"min(r {index}, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) {index})"
+    lines = [
+        f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
+        *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
+        *([_moves(settings)] if settings.reference_every and settings.beta else []),
+        *(_by_token(settings) if settings.advantage == "gae" else _by_response(settings)),
+        f"{settings.prompts} prompts x {settings.responses} responses a batch, "
+        f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",
+    ]
+    return "\n".join(lines)
+
+
+def _by_response(settings: TextLearnerSettings) -> list[str]:
+    apart = "sum_t [log pi_old(y_t) - log ref(y_t)]"
+    others = "the batch's" if settings.advantage == "batch_mean" else "the prompt's other"
+    beside = f" - {_beta(settings)} (K_i - mean of {others} K_j),  K_i = {apart}"
+    after = beside if settings.beta and settings.kl_in == "advantage" else ""
+    in_reward = f" - {_beta(settings)} {apart}" if settings.beta and not after else ""
+    advantage = f"A_i = {ADVANTAGES[settings.advantage]}{after}"
+    if settings.score == "raw":
+        return [advantage, f"R_i = {_score(settings)}{in_reward}"]
+    won = "mean of s(x_i - x_j) over the prompt's others,  s(d) = 1 / (1 + exp(-d))"
+    return [advantage, f"R_i = w_i{in_reward},  w_i = {won}", f"x_i = {_score(settings)}"]
+
+
+def _by_token(settings: TextLearnerSettings) -> list[str]:
+    """With a critic: the score comes with a response's last token, T."""
+    how = settings.critic
+    kl = f" - {_beta(settings)} [log pi_old(y_t) - log ref(y_t)]" if settings.beta else ""
+    clip = "" if how.clip is None else f", V within {how.clip:g} of V_old"
+    return [
+        f"A_t = sum_k {how.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]" + (", whitened" if how.whiten else ""),
+        f"R_t = [t = T] {_score(settings)}{kl}",
+        f"minus {how.weight:g} mean_t [ (V(t) - A_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[how.network]}",
+    ]
+
+
+def _beta(settings: TextLearnerSettings) -> str:
+    return f"{settings.beta:g}" + (f" (steered to {settings.kl_target:g} nats)" if settings.kl_target else "")
+
+
+def _moves(settings: TextLearnerSettings) -> str:
+    mix = settings.reference_mix
+    return f"ref <- {1 - mix:.2g} ref + {mix:g} pi after each {settings.reference_every} updates"
+
+
+def _score(settings: TextLearnerSettings) -> str:
+    """What is learned from of a response's score."""
+    score = "score(y_i)" if settings.reward_clip is None else f"clip(score(y_i), +-{settings.reward_clip:g})"
+    cost = f" - {settings.length_cost:g} tokens(y_i)" if settings.length_cost else ""
+    end = "" if settings.drop_unended else f" - {settings.missing_end_penalty:g} [no end token]"
+    return score + end + cost + (", of responses with an end token alone" if settings.drop_unended else "")

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from shell import Shell
@@ -104,3 +105,51 @@ def test_a_policy_answers_the_prompts_of_a_file(prefrl: Shell, own_model: Path) 
     assert prefrl("run control/toy loop.rounds=1 loop.labels=8 --out toy") == 0
     assert prefrl("generate toy --prompts prompts.jsonl --to other.jsonl") == 2
     assert "its policy is no language model" in prefrl.err
+
+
+def test_of_several_responses_the_best_by_the_reward_is_written(
+    prefrl: Shell, finished_tiny: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefrl import stages
+
+    run = finished_tiny["text/toy"]
+    write("prompts.jsonl", *({"prompt": f"The plot {word}"} for word in ("was", "is")))
+    assert prefrl(f"generate {run} --prompts prompts.jsonl --samples 4 --to all.jsonl") == 0
+    assert prefrl(f"generate {run} --prompts prompts.jsonl --best-of 4") == 0
+    pools, chosen = (
+        [json.loads(line) for line in Path(name).read_text().split("\n")[:-1]]
+        for name in ("all.jsonl", "responses.jsonl")
+    )
+    policy = stages.policy_of(run)
+    reward = stages.reward_of(run, policy.task)
+    how = stages.Drawn(samples=4)
+    for pool, row, (_, found) in zip(
+        pools, chosen, stages._answered(policy, ["The plot was", "The plot is"], how, 0, 16), strict=True
+    ):
+        scores = reward.score(found)
+        assert [one.text for one in found] == pool["responses"]  # the same are drawn
+        assert row["responses"] == [pool["responses"][int(scores.argmax())]]
+        assert row["scores"] == [pytest.approx(float(scores.max()))]
+
+    monkeypatch.setattr(type(reward), "score", lambda _, candidates: np.full(len(candidates), np.nan))
+    assert prefrl(f"generate {run} --prompts prompts.jsonl --best-of 4 --to unscored.jsonl") == 0
+    row = json.loads(Path("unscored.jsonl").read_text().split("\n")[0])
+    assert row["scores"] == [None]
+    assert row["responses"] == pools[0]["responses"][:1]
+
+
+def test_what_best_of_cannot_mean_is_refused(
+    prefrl: Shell, finished_tiny: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefrl.reward_models.text import TransformerReward
+
+    run = finished_tiny["text/toy"]
+    write("prompts.jsonl", {"prompt": "The plot was"})
+    for extra, said in (("--samples 2", "leave --samples out"), ("--temperature 0", "raise --temperature")):
+        assert prefrl(f"generate {run} --prompts prompts.jsonl --best-of 4 {extra}") == 2
+        assert said in prefrl.err
+    assert prefrl(f"generate {run} --prompts prompts.jsonl --best-of 0") == 2
+    monkeypatch.setattr(TransformerReward, "fitted", False)
+    assert prefrl(f"generate {run} --prompts prompts.jsonl --best-of 2") == 2
+    assert "its reward model was not fitted yet" in prefrl.err
+    assert not Path("responses.jsonl").exists()

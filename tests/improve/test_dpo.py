@@ -1,42 +1,68 @@
-"""Direct preference optimisation: its optimum by exact enumeration, and what it learns from a store."""
+"""Direct preference optimisation: its optima by exact enumeration, and what it learns from a store."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
+import preferred
 import pytest
 import torch
+from preferred import LIKES, NO_REWARD, SMALL
+from test_fixed_points import solved as solved  # a fixture
 from torch import Tensor
 
 from prefrl.envs.text import Reviews
-from prefrl.improve.dpo import DPO, DPOSettings
-from prefrl.improve.objectives import dpo_loss
-from prefrl.judgements import Comparison, Judgement, Ranking
-from prefrl.protocols import RewardModel
+from prefrl.improve.direct import Direct
+from prefrl.improve.dpo import DPOSettings
+from prefrl.improve.objectives import dpo_loss, ipo_loss
+from prefrl.judgements import Judgement, Ranking
+from prefrl.protocols import Store as AnyStore
 from prefrl.store import Store
-from prefrl.types import Floats, Query, Response
+from prefrl.types import Query, Response
 
 V, L, BETA = 3, 3, 0.4
 SEQUENCES = torch.tensor(list(itertools.product(range(V), repeat=L)))
 PAIRS = torch.tensor(list(itertools.combinations(range(len(SEQUENCES)), 2)))
+FIRST, SECOND = PAIRS.T
 REWARD = torch.randn(len(SEQUENCES), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 REFERENCE = torch.randn(len(SEQUENCES), generator=torch.Generator().manual_seed(1), dtype=torch.float64).log_softmax(0)
 
 
-def loss_of(logits: Tensor, smoothing: float = 0.0) -> Tensor:
+def gaps_of(logits: Tensor) -> Tensor:
+    gains = logits.log_softmax(0) - REFERENCE
+    return gains[FIRST] - gains[SECOND]
+
+
+def sigmoid_loss(logits: Tensor) -> Tensor:
     """The loss over all pairs of the 27 sequences, judged as Bradley and Terry would by the reward."""
-    gains = BETA * (logits.log_softmax(0) - REFERENCE)
-    first, second = PAIRS.T
-    preference = (REWARD[first] - REWARD[second]).sigmoid()
-    return dpo_loss(gains[first] - gains[second], preference, smoothing).mean()
+    return dpo_loss(BETA * gaps_of(logits), (REWARD[FIRST] - REWARD[SECOND]).sigmoid(), 0.0).mean()
 
 
-def test_its_optimum_is_the_reference_tilted_by_the_reward() -> None:
-    best = (REFERENCE + REWARD / BETA).log_softmax(0).requires_grad_()
+def preferences() -> Tensor:
+    """(27, 27) how probable it is that each is better than each; no reward explains it."""
+    draw = torch.rand(len(SEQUENCES), len(SEQUENCES), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return draw.triu(1) + (1 - draw.T).tril(-1) + 0.5 * torch.eye(len(SEQUENCES), dtype=torch.float64)
+
+
+def square_loss(logits: Tensor) -> Tensor:
+    return ipo_loss(gaps_of(logits), preferences()[FIRST, SECOND], 0.0, BETA).mean()
+
+
+OPTIMA = {
+    "the reference tilted by the reward": (sigmoid_loss, REFERENCE + REWARD / BETA),
+    # Azar et al. 2024, equation 9, its Psi being the identity: by how often each beats the others.
+    "the reference tilted by the chance to win": (square_loss, REFERENCE + preferences().mean(1) / BETA),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMA)
+def test_its_optimum_is(name: str) -> None:
+    loss_of, tilted = OPTIMA[name]
+    best = tilted.log_softmax(0).requires_grad_()
     torch.testing.assert_close(torch.autograd.grad(loss_of(best), best)[0], torch.zeros_like(best))
     other = REFERENCE.clone().requires_grad_()
     optimizer = torch.optim.LBFGS([other], max_iter=500, tolerance_grad=1e-12, tolerance_change=1e-16)
@@ -61,52 +87,56 @@ def test_smoothing_takes_a_share_of_judgements_to_be_wrong() -> None:
     torch.testing.assert_close(dpo_loss(margin, torch.full_like(sure, 0.5), 0.0), 0.5 * right + 0.5 * wrong)
 
 
-class Likes:
-    """Scores a response by how often it says "the"."""
+def test_the_square_is_of_the_distance_from_half_of_one_over_beta() -> None:
+    gaps, sure = torch.tensor([3.0, -1.0]), torch.ones(2)
+    assert ipo_loss(gaps, sure, 0.0, 0.25).tolist() == [1.0, 9.0]  # 1 / (2 x 0.25) = 2
+    assert ipo_loss(-gaps, 1 - sure, 0.0, 0.25).tolist() == [1.0, 9.0]  # the second one is better
+    assert ipo_loss(gaps, torch.tensor([0.75, 0.5]), 0.0, 0.25).tolist() == [0.75 + 0.25 * 25, 0.5 * 9 + 0.5 * 1]
+    assert ipo_loss(gaps, sure, 0.25, 0.25).tolist() == [0.75 + 0.25 * 25, 0.75 * 9 + 0.25 * 1]
 
-    def score(self, candidates: Sequence[Response]) -> Floats:
-        return np.array([r.text.split().count("the") for r in candidates], np.float32)
+
+def learner(task: Any, **changes: object) -> Direct:
+    settings = SMALL | {"minibatch": 8, "epochs": 3} | changes
+    return DPOSettings.model_validate(settings).build(task, np.random.default_rng(0))
 
 
-LIKES = cast("RewardModel[Response]", Likes())
-SMALL: dict[str, Any] = {
-    "evaluation_prompts": 64,
-    "learning_rate": 5e-3,
-    "minibatch": 8,
-    "epochs": 3,
-    "policy": {"chunk": 6},
+@pytest.fixture(scope="module")
+def judged(toy_reviews: Reviews) -> AnyStore[Response]:
+    return preferred.toy_answers(toy_reviews)
+
+
+@pytest.fixture(scope="module")
+def few(toy_reviews: Reviews) -> AnyStore[Response]:
+    return preferred.toy_answers(toy_reviews, 40)
+
+
+ANSWERS: dict[str, Callable[[float], float]] = {
+    "sigmoid": lambda lead: 1 / (1 + float(np.exp(-lead))),
+    "ipo": lambda lead: 0.5 + lead,
 }
+"""The preference that each loss takes a lead of the implied reward for."""
 
 
-def learner(task: Reviews, **changes: object) -> DPO:
-    return DPOSettings.model_validate({**SMALL, **changes}).build(task, np.random.default_rng(0))
+@pytest.mark.parametrize("loss", ANSWERS)
+def test_a_policy_has_nothing_to_learn_from_answers_by_the_reward_that_it_implies(solved: Any, loss: str) -> None:
+    task, best = solved
+    settings = DPOSettings.model_validate({"loss": loss, "beta": 0.05, "minibatch": 1000})
+    reward = preferred.implied(best, task.start, settings.beta)
+    there, away = preferred.at(best, settings, task), settings.build(task, np.random.default_rng(0))
+    store = preferred.answers(there.sample(200, np.random.default_rng(0)), reward, ANSWERS[loss])
+    found = there.improve(NO_REWARD, store, np.random.default_rng(0))
+    assert found["margin"] > 0.02
+    assert found["grad_norm"] < 1e-4
+    assert away.improve(NO_REWARD, store, np.random.default_rng(0))["grad_norm"] > 0.01
 
 
-@pytest.fixture
-def judged(toy_reviews: Reviews, tmp_path: Path) -> Store[Response]:
-    """Pairs of the starting policy's responses, of which the one that says the word more often is better."""
-    found = learner(toy_reviews).sample(160, np.random.default_rng(0))
-    store = Store[Response](tmp_path / "judged")
-    queries = [Query((a, b)) for a, b in zip(found[::2], found[1::2], strict=True) if a.id != b.id]
-    store.ask(queries)
-    store.answer([said(query) for query in queries])
-    return store
-
-
-def said(query: Query[Response]) -> Comparison:
-    first, second = Likes().score(query.candidates)
-    return Comparison(query.id, 0.5 + 0.5 * float(np.sign(first - second)), labeler="one")
-
-
-def flat(one: DPO) -> Tensor:
-    return torch.cat([p.flatten() for p in one.state()["model"].values()])
-
-
-def test_it_learns_what_was_preferred_and_never_asks_the_reward(toy_reviews: Reviews, judged: Store[Response]) -> None:
+def test_it_learns_what_was_preferred_and_never_asks_the_reward(
+    toy_reviews: Reviews, judged: AnyStore[Response]
+) -> None:
     one = learner(toy_reviews)
     before = one.evaluate(LIKES, np.random.default_rng(0)).metrics
     for number in range(3):
-        metrics = one.improve(cast("RewardModel[Response]", None), judged, np.random.default_rng(number))
+        metrics = one.improve(NO_REWARD, judged, np.random.default_rng(number))
     after = one.evaluate(LIKES, np.random.default_rng(0)).metrics
     assert after["learned"] > before["learned"] + 0.3
     assert 0.6 < metrics["accuracy"] <= 1
@@ -115,27 +145,41 @@ def test_it_learns_what_was_preferred_and_never_asks_the_reward(toy_reviews: Rev
     assert one.steps.learn == 0  # it writes nothing to learn from
 
 
+@pytest.mark.parametrize("changes", [{"loss": "ipo"}, {"length_normalised": True, "beta": 2.0}], ids=str)
+def test_so_it_does_by_the_other_losses(toy_reviews: Reviews, few: AnyStore[Response], changes: dict[str, Any]) -> None:
+    one = learner(toy_reviews, **changes)
+    first, _, third = (one.improve(NO_REWARD, few, np.random.default_rng(number)) for number in range(3))
+    assert third["loss"] < first["loss"]
+    assert third["accuracy"] > first["accuracy"] + 0.1
+
+
 def test_the_same_seed_gives_the_same_bytes_and_a_resumed_learner_goes_on_alike(
-    toy_reviews: Reviews, judged: Store[Response]
+    toy_reviews: Reviews, few: AnyStore[Response]
 ) -> None:
-    whole, first, second = (learner(toy_reviews, epochs=1) for _ in range(3))
-    for seed in (1, 2):
-        whole.improve(LIKES, judged, np.random.default_rng(seed))
-    first.improve(LIKES, judged, np.random.default_rng(1))
-    second.load(first.state())
-    second.improve(LIKES, judged, np.random.default_rng(2))
-    assert torch.equal(flat(whole), flat(second))
-    assert not torch.equal(flat(whole), flat(first))
+    settings = DPOSettings.model_validate(SMALL | {"minibatch": 8, "epochs": 1})
+    preferred.check_resumed(settings, toy_reviews, NO_REWARD, few)
 
 
-def test_the_size_of_a_chunk_changes_a_step_by_rounding_only(toy_reviews: Reviews, judged: Store[Response]) -> None:
-    found = []
-    for chunk in (2, 1000):
-        one = learner(toy_reviews, policy={"chunk": chunk}, minibatch=1000, epochs=1)
-        found.append(one.improve(LIKES, judged, np.random.default_rng(1)))
+def test_the_size_of_a_chunk_changes_a_step_by_rounding_only(toy_reviews: Reviews, few: AnyStore[Response]) -> None:
+    settings = DPOSettings.model_validate(SMALL | {"minibatch": 1000})
+    found = preferred.with_chunks(settings, toy_reviews, NO_REWARD, few)
     for name in ("loss", "grad_norm", "margin"):
         assert found[0][name] == pytest.approx(found[1][name], rel=1e-3, abs=1e-4)
     assert found[0]["loss"] == pytest.approx(np.log(2), abs=1e-4)  # at the start nothing has been gained
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_normalised_log_ratios_are_means_over_tokens(toy_reviews: Reviews, normalised: bool) -> None:
+    one = learner(toy_reviews, length_normalised=normalised, beta=2.0, epochs=1)
+    pair = one.sample(4, np.random.default_rng(0))[:2]
+    assert len(pair[0].tokens) != len(pair[1].tokens)
+    store = preferred.answers(pair, preferred.in_this_order(pair))
+    one.improve(NO_REWARD, store, np.random.default_rng(0))  # now there are gains
+    gains = preferred.gains(one, pair)
+    if normalised:
+        gains = [gain / len(each.tokens) for gain, each in zip(gains, pair, strict=True)]
+    found = one.improve(NO_REWARD, store, np.random.default_rng(0))
+    assert found["margin"] == pytest.approx(2.0 * (gains[0] - gains[1]), rel=1e-3)
 
 
 def test_the_pairs_of_a_ranking_count_as_one_judgement(toy_reviews: Reviews, tmp_path: Path) -> None:
@@ -157,3 +201,6 @@ def test_a_store_without_a_judged_pair_is_an_error(toy_reviews: Reviews, text_st
 def test_the_formula_says_what_the_settings_say() -> None:
     assert "mean[ 1 log s(h) ]" in DPOSettings().formula()
     assert "0.9 log s(h) + 0.1 log s(-h)" in DPOSettings(label_smoothing=0.1).formula()
+    assert "mean[ 1 (d - 5)^2 ]" in DPOSettings(loss="ipo").formula()
+    assert "0.9 (d - 5)^2 + 0.1 (d + 5)^2" in DPOSettings(loss="ipo", label_smoothing=0.1).formula()
+    assert "log ref(worse)] / tokens(worse)" in DPOSettings(length_normalised=True).formula()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -34,6 +35,8 @@ CLAIMING: dict[str, dict[str, Any]] = {
     "reinforce": {"algorithm": "reinforce"},
     "rloo, KL off the advantage": {"kl_in": "advantage"},
     "clipped": {"clip": 0.2, "epochs": 2, "minibatches": 2},
+    # Where worth is 0 or 1, win rates are that worth, smaller by a factor, whatever the policy is.
+    "rloo, by win rates": {"score": "win_rate", "beta": BETA * (1 / (1 + math.exp(-1)) - 0.5)},
     "ppo": PPO,
     "ppo, its critic a network of its own": PPO | {"critic": {"network": "own"}},
     "clipped, KL off the advantage": {"clip": 0.2, "epochs": 2, "minibatches": 2, "kl_in": "advantage"},

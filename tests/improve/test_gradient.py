@@ -103,6 +103,19 @@ def test_a_step_is_the_gradient_of_the_objective_written_out() -> None:
     assert metrics["grad_norm"] == pytest.approx(float(norm))
 
 
+@pytest.mark.parametrize(("away", "moves"), [(0.05, True), (0.3, False), (-0.3, True)])
+def test_a_value_that_went_far_from_the_batchs_towards_its_target_learns_no_more(away: float, moves: bool) -> None:
+    def gone(batch: Batch[Rows]) -> Batch[Rows]:
+        now = torch.zeros_like(batch.logp)  # the table's
+        return replace(batch, values=now - away, returns=torch.ones_like(now))
+
+    found, metrics = measure(Objective(value=1.0, value_clip=0.1), change=gone)
+    assert bool(found[1].any()) is moves
+    # The larger loss counts: the one at the border, or the plain one where the value went the wrong way.
+    expected = max(0.5, 0.5 * (1 + away - 0.1) ** 2) if away > 0 else 0.5
+    assert metrics["value_loss"] == pytest.approx(expected)
+
+
 def test_before_the_first_step_the_clip_changes_nothing_and_no_ratio_is_off() -> None:
     plain, _ = measure(Objective())
     clipped, metrics = measure(Objective(clip=0.2))

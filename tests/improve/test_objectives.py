@@ -240,6 +240,17 @@ def test_the_adaptive_coefficient_moves_towards_its_target_and_no_faster_than_al
     assert start.update(0.0, 100).beta == pytest.approx(0.1 * (1 - 0.2 * 0.1))
 
 
+def test_win_rates_by_hand() -> None:
+    nan = float("nan")
+    found = o.win_rates(torch.tensor([[0.0, 2.0, -1.0], [5.0, nan, 5.0], [nan, 3.0, nan]], dtype=torch.float64))
+    s = torch.tensor([0.0, 1.0, 2.0, 3.0], dtype=torch.float64).sigmoid()
+    others = torch.stack([((1 - s[2]) + s[1]) / 2, (s[2] + s[3]) / 2, ((1 - s[1]) + (1 - s[3])) / 2])
+    torch.testing.assert_close(found[0], (2 * others + 0.5) / 3)
+    torch.testing.assert_close(o.leave_one_out(found[:1])[0], others - 0.5)
+    torch.testing.assert_close(found[1:], found.new_tensor([[0.5, nan, 0.5], [nan, 0.5, nan]]), equal_nan=True)
+    assert float(found[0].mean()) == pytest.approx(0.5)  # what one wins another loses
+
+
 def test_what_was_not_scored_is_in_no_baseline() -> None:
     """By hand: as if it were not there."""
     scores = torch.tensor([[1.0, 3.0, math.nan], [math.nan, 5.0, math.nan]])

@@ -13,8 +13,7 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of
-from prefrl.improve.text_formula import text_formula
+from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
@@ -416,6 +415,7 @@ def test_a_score_is_cut_before_anything_is_taken_off_it(toy_reviews: Reviews) ->
     [
         ({"responses": 1}, "at least 2 responses"),
         ({"epochs": 2}, "need a clip"),
+        ({"score": "win_rate", "advantage": "batch_mean", "responses": 1}, "at least 2, and no critic"),
         ({"minibatches": 1000, "clip": 0.2}, "cannot be 1000 minibatches"),
         ({"kl_target": 3.0, "beta": 0.0}, "beta must start above 0"),
     ],
