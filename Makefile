@@ -80,7 +80,7 @@ docs: .venv/dev
 	$(BIN)/sphinx-build -q -W -b html docs docs/_build/html
 
 # Peers for the benchmarks live in environments of their own: their pins conflict with ours, and with each other's.
-peers: .venv-peers-text/ready .venv-peers-control/ready
+peers: .venv-peers-text/ready .venv-peers-ppo/ready .venv-peers-control/ready
 
 .venv-peers-%/ready: benchmarks/peers-%.txt
 	$(PYTHON) -m venv .venv-peers-$*

@@ -1,7 +1,8 @@
-"""One update of a language model on both sides, in turns: what text_rloo, text_ragged and text_lora have in common.
+"""One update of a language model on both sides, in turns: what text_rloo, text_ppo, text_ragged and text_lora share.
 
-prefrl's text learner against TRL's trainers, from the same weights and prompts, one Adam step, KL to a reference, no
-dropout, no gradient checkpointing, one thread each. CPU seconds of an update are compared by their medians.
+prefrl's text learner against TRL's trainers, from the same weights and prompts, one Adam step (of PPO one an epoch), KL
+to a reference, no dropout, no gradient checkpointing, one thread each. CPU seconds of an update are compared by their
+medians.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +38,10 @@ class Update:
     """The most tokens of a response."""
     fixed: bool = True
     """Whether responses have exactly so many tokens, or end where they end."""
-    algorithm: Literal["rloo", "grpo"] = "rloo"
+    algorithm: Literal["rloo", "grpo", "ppo"] = "rloo"
+    critic: Literal["shared", "own"] = "shared"
+    """Of PPO: whose hidden states it reads."""
+    epochs: int = 1
     lora_rank: int = 0
     """0 to train everything."""
     chunk: int = 64
@@ -53,12 +57,10 @@ class Update:
             at += self.prompts
 
 
-def options_of(description: str | None) -> argparse.ArgumentParser:
+def options_of(description: str | None, peers: str = ".venv-peers-text") -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--short", action="store_true", help="fewer repetitions: under two minutes")
-    parser.add_argument(
-        "--peers", default=".venv-peers-text/bin/python", help="Python of the environment that holds TRL"
-    )
+    parser.add_argument("--peers", default=f"{peers}/bin/python", help="Python of the environment that holds TRL")
     return parser
 
 
@@ -73,7 +75,7 @@ def compare(work: Update, peers: str, repetitions: int) -> dict[str, Any]:
     Where responses end where they end, the sides draw others: then seconds are those of 1000 tokens.
     """
     if not Path(peers).exists():
-        sys.exit(f"no {peers}: run `make peers`, or install benchmarks/peers-text.txt and say --peers")
+        sys.exit(f"no {peers}: run `make peers`, or install benchmarks/peers-*.txt and say --peers")
     said = json.dumps(asdict(work))
     workers = {
         name: start([python, __file__, name, said]) for name, python in {"ours": sys.executable, "peer": peers}.items()
@@ -131,7 +133,9 @@ def ours(work: Update) -> None:
     )
     reward: Any = SimpleNamespace(score=lambda found: np.array([reward_of(list(r.tokens)) for r in found], np.float32))
     sizes = {"updates": 1, "prompts": work.prompts, "responses": work.samples}
-    steps = {"beta": BETA, "learning_rate": work.learning_rate, "missing_end_penalty": 0.0}
+    steps = {"beta": BETA, "learning_rate": work.learning_rate, "missing_end_penalty": 0.0, "epochs": work.epochs}
+    if work.algorithm == "ppo":
+        steps["critic"] = {"network": work.critic, "trace": 0.95, "clip": 0.2}
     adapters = {"train": "lora", "lora_rank": work.lora_rank} if work.lora_rank else {}
     policy = {"chunk": work.chunk, **adapters}
     settings = TextLearnerSettings.model_validate({"algorithm": work.algorithm, **sizes, **steps, "policy": policy})
@@ -144,10 +148,13 @@ def ours(work: Update) -> None:
 
 
 def peer(work: Update) -> None:
+    if work.algorithm == "ppo":
+        peer_ppo(work)
+        return
     import torch
     from datasets import Dataset
     from peft import LoraConfig
-    from transformers import PreTrainedTokenizerFast, TrainerCallback
+    from transformers import PreTrainedTokenizerFast
     from trl import GRPOConfig, GRPOTrainer, RLOOConfig, RLOOTrainer
 
     torch.set_num_threads(1)
@@ -157,16 +164,6 @@ def peer(work: Update) -> None:
     def score(completion_ids: list[list[int]], **_: Any) -> list[float]:
         counts.append(sum(map(len, completion_ids)))
         return [reward_of(tokens) for tokens in completion_ids]
-
-    class Turns(TrainerCallback):
-        begin = 0.0
-
-        def on_train_begin(self, *_: Any, **__: Any) -> None:
-            self.begin = wait()
-
-        def on_step_end(self, *_: Any, **__: Any) -> None:
-            tell(self.begin, counts[-1])
-            self.begin = wait()
 
     settings, trainer = {"rloo": (RLOOConfig, RLOOTrainer), "grpo": (GRPOConfig, GRPOTrainer)}[work.algorithm]
     config = settings(
@@ -206,9 +203,99 @@ def peer(work: Update) -> None:
         config,
         data,
         processing_class=tokenizer,
-        callbacks=[Turns()],
+        callbacks=[turns(lambda: counts[-1])],
         peft_config=adapters if work.lora_rank else None,
     ).train()
+
+
+def peer_ppo(work: Update) -> None:
+    """The last PPO of TRL. Its critic is always a model by itself; one that shares has the policy's trunk in it."""
+    import torch
+    from datasets import Dataset
+    from transformers import AutoModelForCausalLM, AutoModelForSequenceClassification, PreTrainedTokenizerFast
+    from trl.experimental.ppo import PPOConfig, PPOTrainer
+
+    torch.set_num_threads(1)
+    tokenizer = PreTrainedTokenizerFast.from_pretrained(work.folder, padding_side="left")
+    count = work.prompts * work.samples
+    config = PPOConfig(
+        output_dir=str(Path(work.folder) / "peer"),
+        per_device_train_batch_size=count,
+        local_rollout_forward_batch_size=work.chunk,
+        num_mini_batches=1,
+        num_ppo_epochs=work.epochs,
+        response_length=work.new_tokens,
+        stop_token=None,
+        kl_coef=BETA,
+        learning_rate=work.learning_rate,
+        lr_scheduler_type="constant",
+        num_sample_generations=0,
+        total_episodes=10**6,
+        bf16=False,
+        use_cpu=True,
+        gradient_checkpointing=False,
+        save_strategy="no",
+        logging_strategy="no",
+        report_to="none",
+        disable_tqdm=True,
+    )
+    rounds = work.rounds()
+    data = Dataset.from_dict({"input_ids": [tokenizer.encode(p) for _ in range(50) for p in next(rounds)]})
+    policy, reference = (AutoModelForCausalLM.from_pretrained(work.folder, dtype=torch.float32) for _ in range(2))
+    critic = AutoModelForSequenceClassification.from_pretrained(work.folder, num_labels=1, dtype=torch.float32)
+    if work.critic == "shared":
+        critic.model = policy.model
+    PPOTrainer(
+        args=config,
+        processing_class=tokenizer,
+        model=policy,
+        ref_model=reference,
+        reward_model=free_reward(),
+        train_dataset=data,
+        eval_dataset=data,
+        value_model=critic,
+        callbacks=[turns(lambda: count * work.new_tokens)],
+    ).train()
+
+
+def free_reward() -> Any:
+    """`reward_of` as the model that TRL's PPO wants."""
+    import torch
+
+    class Trunk(torch.nn.Module):
+        def forward(self, input_ids: Any, **_: Any) -> SimpleNamespace:
+            return SimpleNamespace(
+                hidden_states=[(input_ids % 2 == 0).float().mean(1, keepdim=True).expand_as(input_ids)]
+            )
+
+    class Reward(torch.nn.Module):
+        base_model_prefix = "trunk"
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.trunk = Trunk()
+
+        def score(self, states: Any) -> Any:
+            return states[..., None]
+
+    return Reward()
+
+
+def turns(tokens: Callable[[], int]) -> Any:
+    """Makes a trainer of transformers wait before each step until it is asked for, and tell what it took."""
+    from transformers import TrainerCallback
+
+    class Turns(TrainerCallback):
+        begin = 0.0
+
+        def on_train_begin(self, *_: Any, **__: Any) -> None:
+            self.begin = wait()
+
+        def on_step_end(self, *_: Any, **__: Any) -> None:
+            tell(self.begin, tokens())
+            self.begin = wait()
+
+    return Turns()
 
 
 if __name__ == "__main__":
