@@ -224,7 +224,8 @@ def generate(
 
     _refuse(to.exists(), f"{to} is there already: choose another name with --to")
     _refuse(bool(best_of) and samples > 1, "--best-of keeps one of N responses to each prompt: leave --samples out")
-    _refuse(bool(best_of) and temperature == 0, "--best-of wants responses that differ: raise --temperature above 0")
+    same = temperature == 0 or top_k == 1 or top_p == 0
+    _refuse(bool(best_of) and same, "--best-of wants responses that differ: raise --temperature, --top-k or --top-p")
     policy = stages.policy_of(folder)
     texts = stages.prompts_for(policy, prompts)
     how = stages.Drawn(best_of or samples, temperature, top_k, top_p)

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.improve.direct import Direct, DirectSettings, Pairs, judged, means, step
@@ -23,6 +23,7 @@ from prefrl.improve.objectives import kto_loss
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguagePolicy
 from prefrl.policies.logprobs import in_all_rows
+from prefrl.policies.pretrained import context_of
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, text
 from prefrl.types import Integers, Metrics, Response
@@ -40,6 +41,12 @@ class KTOSettings(DirectSettings):
     """Passes over all pairs in a round."""
     minibatch: int = Field(16, ge=2)
     """Pairs in a gradient step; the reference point is estimated on them."""
+
+    @model_validator(mode="after")
+    def _teaches(self) -> KTOSettings:
+        if self.desirable == self.undesirable == 0:
+            raise ValueError("desirable and undesirable are both 0, and nothing is learned: raise one of them")
+        return self
 
     def shrunk(self) -> KTOSettings:
         return self.model_copy(update={"epochs": 1, "evaluation_prompts": 8})
@@ -81,10 +88,12 @@ def improve(
 
 def reference_point(policy: LanguagePolicy, pairs: Pairs, at: Integers) -> Tensor:
     """The mean gain, at least 0, of responses of a minibatch as answers to the prompts of its next pair: an estimate of
-    KL(pi, ref). 0 where all prompts are the same."""
+    KL(pi, ref). 0 where all prompts are the same, or none of these fits into the model's context."""
     rows = pairs.rows.rows(torch.from_numpy(pairs.edges[at].flatten()).to(policy.device))
-    others = _shifted(rows)
-    apart = [i for i in range(len(rows)) if others.prompt_tokens[i] != rows.prompt_tokens[i]]
+    others, context = _shifted(rows), context_of(policy.model)
+    # A response need not fit behind another prompt.
+    room = [context is None or length <= context for length in others.lengths().tolist()]
+    apart = [i for i in range(len(rows)) if room[i] and others.prompt_tokens[i] != rows.prompt_tokens[i]]
     if not apart:
         return pairs.start.new_zeros(())
     # All rows of the minibatch, whichever rank has them: the point is the same on any number of ranks.

@@ -91,9 +91,9 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
 
 
 def win_rates(scores: Tensor) -> Tensor:
-    """(P, K) scores of K responses to each of P prompts -> the probability that each beats one of its prompt's.
+    """(P, K) scores of K responses to each of P prompts -> how often each beats one of its prompt's.
 
-    Scores are those of Bradley and Terry: a beats b with probability s(score_a - score_b). A response ties with itself;
+    By Bradley and Terry, from the scores as they are: a beats b with s(score_a - score_b). A response ties with itself;
     `leave_one_out` takes that out again, and leaves the win rate against the others minus a half.
     """
     apart = scores[:, :, None] - scores[:, None, :]  # (P, K, K)

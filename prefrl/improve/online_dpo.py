@@ -36,8 +36,8 @@ class OnlineDPOSettings(PairLossSettings):
     responses: int = Field(2, ge=2)
     """K: responses to each prompt, of which the best and the worst make a pair."""
     soft: bool = False
-    """Learn from how probable it is that the better one is better, s(its score - the other's), rather than as if that
-    were sure: the policy then stops at the starting one tilted by the scores, ref x exp(score / beta)."""
+    """Let the better one of a pair be better by s(its score - the other's), rather than for sure: with the sigmoid loss
+    the policy then stops at the starting one tilted by the scores, ref x exp(score / beta)."""
     missing_end_penalty: float = Field(1.0, ge=0)
     """Taken off the score of a response that reached the task's most tokens without an end token."""
 
@@ -88,7 +88,8 @@ def _update(
     start = policy.start_logp(drawn).sum(1)
     worth = scores - settings.missing_end_penalty * ~to_numpy(drawn.ended)
     pairs = pairs_of(settings, drawn, start, worth)
-    learned = step(writer, settings, pairs, np.arange(len(pairs)), settings.pair_loss) if len(pairs) else {}
+    enough = len(pairs) >= policy.least_rows
+    learned = step(writer, settings, pairs, np.arange(len(pairs)), settings.pair_loss) if enough else {}
     counts = {"pairs": float(len(pairs)), "equal_groups": 1 - len(pairs) / settings.prompts}
     return learned | counts | _measured(drawn, start, scores)
 

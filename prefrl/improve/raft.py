@@ -67,6 +67,9 @@ class RAFTSettings(Settings):
     def with_evaluation_of(self, other: RAFTSettings) -> RAFTSettings:
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
 
+    def work(self) -> float:
+        return float(self.updates * self.prompts)
+
     def build(self, task: Task, rng: np.random.Generator) -> RAFT:
         return RAFT(self, text(task, f"learner kind {self.kind!r} writes text"), rng)
 
@@ -108,6 +111,10 @@ class RAFT:
         """The rows to learn, at most one a prompt, and what the batch is like."""
         settings, device = self._settings, self.policy.device
         raw = torch.from_numpy(scored(reward, drawn.candidates(self.policy.task.tokenizer))).to(device)  # (B,)
+        if raw.isinf().any():
+            raise FloatingPointError(
+                "a reward is infinite; expected finite numbers: look at the reward model's last fit"
+            )
         kl = kl_k1(drawn.logp, self.policy.start_logp(drawn)).sum(1)  # (B,): padding is 0 in both
         groups = (raw - settings.missing_end_penalty * ~drawn.ended - settings.beta * kl).view(-1, settings.responses)
         kept = torch.from_numpy(best(to_numpy(groups)) + np.arange(len(groups)) * settings.responses).to(device)
@@ -119,11 +126,12 @@ class RAFT:
     def _learn(self, rows: Responses, rng: np.random.Generator) -> Iterator[Metrics]:
         for _ in range(self._settings.epochs):
             for at in np.array_split(rng.permutation(len(rows)), -(-len(rows) // self._settings.minibatch)):
+                if len(at) < self.policy.least_rows:
+                    continue  # too few for all ranks
                 parts, longest = self._parts(rows, at), self._settings.max_grad_norm
                 yield descend(self.policy.parameters(), self._writer.optimizer, parts, longest)
 
     def _parts(self, rows: Responses, at: Integers) -> Parts:
-        self.policy.check_share(len(at))
         device = self.policy.device
         tokens = rows.mask[torch.from_numpy(at).to(device)].sum()  # the whole minibatch's: its mean is in parts
         for some in in_parts(at, self._settings.policy.chunk):

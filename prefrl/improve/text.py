@@ -129,8 +129,8 @@ class TextLearnerSettings(Settings):
     length_cost: float = 0.0
     """Taken off the score for each token."""
     score: Literal["raw", "win_rate"] = "raw"
-    """What is learned from: the score itself, or how probable the reward model finds it that a response beats another
-    one to its prompt (`win_rate`, 0 to 1), which is another objective: see docs."""
+    """What is learned from: the score itself, or how often it is the higher one, s(its score - another's) in the mean
+    over a prompt's responses (`win_rate`, 0 to 1), which is another objective: see docs."""
     reward_clip: float | None = Field(None, gt=0)
     """A score is cut to this size, before anything is taken off it."""
     asked_responses: int = Field(4, ge=2)
@@ -148,9 +148,21 @@ class TextLearnerSettings(Settings):
         return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")
-    def _consistent(self) -> TextLearnerSettings:
+    def _advantage_fits(self) -> TextLearnerSettings:
         if self.advantage not in ("batch_mean", "gae") and self.responses < 2:
             raise ValueError(f"advantage {self.advantage} needs at least 2 responses, got {self.responses}")
+        if self.score == "win_rate" and self.advantage != "leave_one_out":
+            raise ValueError("score win_rate compares a prompt's responses: it wants advantage leave_one_out")
+        if self.advantage == "gae" and self.policy.shard != "none":
+            raise ValueError("a critic is kept whole: with policy.shard set choose an algorithm without one")
+        if self.advantage != "gae" and self.critic != CriticSettings():
+            raise ValueError(f"advantage {self.advantage} has no critic: set algorithm=ppo, or leave critic out")
+        if self.advantage == "gae" and self.kl_in != "reward":
+            raise ValueError("advantage gae takes the KL off token by token, as a reward: set kl_in=reward")
+        return self
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TextLearnerSettings:
         if self.clip is None and self.epochs * self.minibatches > 1:
             raise ValueError("several gradient steps on a batch (epochs x minibatches > 1) need a clip: set clip=0.2")
         if self.minibatches > self.prompts * self.responses:
@@ -161,10 +173,6 @@ class TextLearnerSettings(Settings):
             raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=0")
         if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
             raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
-        if self.score == "win_rate" and (self.responses < 2 or self.advantage == "gae"):
-            raise ValueError("score win_rate compares a prompt's responses: it wants at least 2, and no critic")
-        if self.advantage == "gae" and self.kl_in != "reward":
-            raise ValueError("advantage gae takes the KL off token by token, as a reward: set kl_in=reward")
         if self.kl_target is not None and self.beta == 0:
             raise ValueError("kl_target steers beta, so beta must start above 0")
         return self
@@ -310,9 +318,9 @@ class TextLearner:
         known = mask & ~scores.isnan()[:, None]
         advantages = torch.where(known, advantages, 0.0)  # where nothing was scored the critic is held where it is
         returns = values + advantages
-        left = masked_mean(advantages**2, known) / masked_mean((returns - masked_mean(returns, known)) ** 2, known)
+        explained = _explained(advantages[known], returns[known])
         white = masked_whiten(advantages, known) if how.whiten else advantages
-        return Batch(drawn, drawn.logp, white, returns, values), {"explained": 1.0 - float(left)}
+        return Batch(drawn, drawn.logp, white, returns, values), {"explained": explained}
 
     def _equal_groups(self, scores: Tensor) -> Metrics:
         """The share of prompts whose responses all have the same score, where there are several."""
@@ -393,6 +401,14 @@ class TextLearner:
         return values
 
 
+def _explained(errors: Tensor, returns: Tensor) -> float:
+    """The share of the returns' variance that the critic foresaw; NaN where they do not vary."""
+    variance = float(returns.var(correction=0)) if len(returns) else 0.0
+    # By rounding returns that are all alike vary too.
+    alike = variance <= 1e-10 * float(returns.square().mean()) if variance else True
+    return math.nan if alike else 1.0 - float(errors.var(correction=0)) / variance
+
+
 def _mean(values: Sequence[float]) -> float:
     """Of the batches in which it is defined."""
     known = [value for value in values if not math.isnan(value)]
@@ -444,7 +460,7 @@ def _by_response(settings: TextLearnerSettings) -> list[str]:
     advantage = f"A_i = {ADVANTAGES[settings.advantage]}{after}"
     if settings.score == "raw":
         return [advantage, f"R_i = {_score(settings)}{in_reward}"]
-    won = "mean of s(x_i - x_j) over the prompt's others,  s(d) = 1 / (1 + exp(-d))"
+    won = f"mean of s(x_i - x_j) over all of the prompt's {settings.responses},  s(d) = 1 / (1 + exp(-d))"
     return [advantage, f"R_i = w_i{in_reward},  w_i = {won}", f"x_i = {_score(settings)}"]
 
 
@@ -454,9 +470,10 @@ def _by_token(settings: TextLearnerSettings) -> list[str]:
     kl = f" - {_beta(settings)} [log pi_old(y_t) - log ref(y_t)]" if settings.beta else ""
     clip = "" if how.clip is None else f", V within {how.clip:g} of V_old"
     return [
-        f"A_t = sum_k {how.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]" + (", whitened" if how.whiten else ""),
+        f"A_t = G_t{', whitened' if how.whiten else ''}",
+        f"G_t = sum_k {how.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]",
         f"R_t = [t = T] {_score(settings)}{kl}",
-        f"minus {how.weight:g} mean_t [ (V(t) - A_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[how.network]}",
+        f"minus {how.weight:g} mean_t [ (V(t) - G_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[how.network]}",
     ]
 
 

@@ -140,9 +140,14 @@ class LanguagePolicy:
         """Whether each of several ranks keeps a share of every weight alone."""
         return not isinstance(self.keeping, Whole)
 
+    @property
+    def least_rows(self) -> int:
+        """How many rows a gradient step must have: one for each rank, where all have to take part."""
+        return world().size if self.spread else 1
+
     def check_share(self, rows: int) -> None:
         """Raises `ConfigError` where a gradient step on so many rows leaves a rank without any that has to have one."""
-        if self.spread and rows < world().size:
+        if rows < self.least_rows:
             raise ConfigError(
                 f"learner.policy.shard=fsdp2: a gradient step on {rows} rows is too small for {world().size} ranks; "
                 "expected at least one for each: make learner's batches larger, or start fewer ranks"

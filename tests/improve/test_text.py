@@ -415,7 +415,9 @@ def test_a_score_is_cut_before_anything_is_taken_off_it(toy_reviews: Reviews) ->
     [
         ({"responses": 1}, "at least 2 responses"),
         ({"epochs": 2}, "need a clip"),
-        ({"score": "win_rate", "advantage": "batch_mean", "responses": 1}, "at least 2, and no critic"),
+        ({"score": "win_rate", "algorithm": "reinforce"}, "wants advantage leave_one_out"),
+        ({"algorithm": "ppo", "policy": {"shard": "fsdp2"}}, "kept whole"),
+        ({"critic": {"network": "own"}}, "has no critic"),
         ({"minibatches": 1000, "clip": 0.2}, "cannot be 1000 minibatches"),
         ({"kl_target": 3.0, "beta": 0.0}, "beta must start above 0"),
     ],
