@@ -69,7 +69,7 @@ def test_at_the_start_half_of_the_weights_is_lost(
 
 
 def test_the_reference_point_is_the_mean_gain_of_responses_to_other_prompts(
-    toy_reviews: Reviews, few: Store[Response]
+    toy_reviews: Reviews, few: Store[Response], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = learner(toy_reviews, undesirable=0.0)  # all gains rise
     data = batch(few.judged())
@@ -86,6 +86,13 @@ def test_the_reference_point_is_the_mean_gain_of_responses_to_other_prompts(
     expected = np.mean(preferred.gains(one, moved))
     assert len(moved) >= 6
     assert expected > 0.01
+    assert float(reference_point(one.policy, pairs, at)) == pytest.approx(expected, abs=1e-3)
+    lengths = [len(one.prompt_tokens) + len(one.tokens) for one in moved]
+    room = sorted(lengths)[len(lengths) // 2]
+    monkeypatch.setattr("prefrl.improve.kto.context_of", lambda model: room)
+    fit = [one for one, length in zip(moved, lengths, strict=True) if length <= room]
+    assert 0 < len(fit) < len(moved)
+    expected = np.mean(preferred.gains(one, fit)).clip(min=0)
     assert float(reference_point(one.policy, pairs, at)) == pytest.approx(expected, abs=1e-3)
 
 
