@@ -83,7 +83,7 @@ def test_the_reference_point_is_the_mean_gain_of_responses_to_other_prompts(
         for each in (data.candidates[a], data.candidates[b]):
             if each.prompt != prompt.prompt:
                 moved.append(Response(prompt.prompt, each.text, prompt.prompt_tokens, each.tokens))
-    expected = np.mean(preferred.gains(one, moved))
+    expected = float(np.mean(preferred.gains(one, moved)))
     assert len(moved) >= 6
     assert expected > 0.01
     assert float(reference_point(one.policy, pairs, at)) == pytest.approx(expected, abs=1e-3)
@@ -92,7 +92,7 @@ def test_the_reference_point_is_the_mean_gain_of_responses_to_other_prompts(
     monkeypatch.setattr("prefrl.improve.kto.context_of", lambda model: room)
     fit = [one for one, length in zip(moved, lengths, strict=True) if length <= room]
     assert 0 < len(fit) < len(moved)
-    expected = np.mean(preferred.gains(one, fit)).clip(min=0)
+    expected = max(0.0, float(np.mean(preferred.gains(one, fit))))
     assert float(reference_point(one.policy, pairs, at)) == pytest.approx(expected, abs=1e-3)
 
 
