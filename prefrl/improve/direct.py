@@ -33,7 +33,7 @@ Improve: TypeAlias = Callable[[Writer, RewardModel[Response], Store[Response], n
 
 
 class DirectSettings(Settings):
-    """The settings that all direct methods have; each method's own class adds its kind and what is particular to it."""
+    """The settings that direct methods and RAFT have; each one's class adds its kind and what is particular to it."""
 
     kind: str
     beta: float = Field(0.1, gt=0)
@@ -171,7 +171,7 @@ def means(seen: list[Metrics]) -> Metrics:
 
 
 class Direct:
-    """A `prefrl.protocols.Learner` of responses. Direct methods are one but for how they improve."""
+    """A `prefrl.protocols.Learner` of responses. Direct methods and RAFT are one but for how they improve."""
 
     def __init__(self, settings: DirectSettings, task: TextTask, improve: Improve, rng: np.random.Generator) -> None:
         self._settings, self._writer, self._improve = settings, Writer(task, settings, rng), improve

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from prefrl.envs.text import Reviews
 from prefrl.evaluate.best_of_n import masses_of_best
-from prefrl.improve.raft import RAFT, RAFTSettings
+from prefrl.improve import raft
+from prefrl.improve.direct import Direct
+from prefrl.improve.raft import RAFTSettings
 from prefrl.protocols import RewardModel, TextTask
 from prefrl.types import Floats, Response
 
@@ -38,15 +40,15 @@ def likes(silent: int = 0) -> RewardModel[Response]:
     return cast("RewardModel[Response]", Likes(silent))
 
 
-def learner(task: TextTask, **changes: object) -> RAFT:
+def learner(task: TextTask, **changes: object) -> Direct:
     return RAFTSettings.model_validate({**SMALL, **changes}).build(task, np.random.default_rng(0))
 
 
-def improve(one: RAFT, seed: int = 1, silent: int = 0) -> dict[str, float]:
+def improve(one: Direct, seed: int = 1, silent: int = 0) -> dict[str, float]:
     return one.improve(likes(silent), NO_STORE, np.random.default_rng(seed))
 
 
-def flat(one: RAFT) -> Tensor:
+def flat(one: Direct) -> Tensor:
     return torch.cat([p.flatten() for p in one.state()["model"].values()])
 
 
@@ -145,7 +147,6 @@ class Same:
 
 def test_what_is_taken_off_a_score_decides_between_equals(toy_reviews: Reviews) -> None:
     one = learner(toy_reviews, responses=4)
-    settings = one._settings
     improve(one)  # so that there is a distance to the start
     drawn = one.policy.respond(toy_reviews.prompts(16, np.random.default_rng(0)), 4, np.random.default_rng(0))
     kl = (drawn.logp - one.policy.start_logp(drawn)).sum(1).view(-1, 4)
@@ -153,8 +154,8 @@ def test_what_is_taken_off_a_score_decides_between_equals(toy_reviews: Reviews) 
     assert 0 < int(ended.sum()) < 64
 
     def kept(reward: Same, **changes: float) -> Tensor:
-        one._settings = settings.model_copy(update={"missing_end_penalty": 0.0} | changes)
-        return one._choose(drawn, cast("RewardModel[Response]", reward))[0]
+        settings = RAFTSettings.model_validate({"responses": 4, "missing_end_penalty": 0.0} | changes)
+        return raft._choose(settings, one.policy, drawn, cast("RewardModel[Response]", reward))[0]
 
     firsts = torch.arange(16) * 4
     assert torch.equal(kept(Same()), firsts)
