@@ -20,7 +20,7 @@ import argparse
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -34,7 +34,7 @@ from prefrl.stages import reward_of
 from prefrl.storage.checkpoints import load_state
 from prefrl.types import Floats, Response
 
-PRESETS = {"raft": "-raft", "dpo": "-dpo"}
+PRESETS = {"ppo": "-ppo", "raft": "-raft", "online_dpo": "-online-dpo", "dpo": "-dpo"}
 """Learners with a preset of their own; the others are algorithms of the task's."""
 RESAMPLES, FEW = 9999, 5
 AT_ONCE = 4
@@ -54,13 +54,15 @@ SHORT = Size(32, 16, ("loop.rounds=1", "loop.labels=40", "learner.updates=2", "l
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="a preset of text")
-    parser.add_argument("--learner", choices=("rloo", "grpo", "raft", "dpo"), default="rloo")
+    parser.add_argument("--learner", choices=("rloo", "grpo", "ppo", "raft", "online_dpo", "dpo"), default="rloo")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=100, help="the first seed")
     parser.add_argument("--out", type=Path, default=Path("runs/best-of-n"))
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the runs")
     parser.add_argument("--short", action="store_true", help="two small runs")
     options = parser.parse_args()
     size, seeds = (SHORT, 2) if options.short else (Size(), options.seeds)
+    size = replace(size, settings=(*options.set, *size.settings))
     rows = []
     for seed in range(options.first, options.first + seeds):
         folder = finished(options.task, options.learner, seed, size, options.out)
@@ -77,7 +79,7 @@ def finished(task: str, learner: str, seed: int, size: Size, out: Path) -> Path:
         settings.append(f"learner.algorithm={learner}")
     if learner == "dpo":
         settings = [one for one in settings if not one.startswith("learner.updates")]
-    short = "-short" if size.settings else ""
+    short = "-short" if size.pool < Size.pool else ""
     folder = out / f"{task.replace('/', '-')}-{learner}{short}-{seed}"
     command = [sys.executable, "-m", "prefrl", "run", preset, *settings, "--out", str(folder)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -6,7 +6,7 @@ more probable it has become than it was under the starting policy, which is the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self, TypeAlias
 
@@ -19,7 +19,7 @@ from prefrl.components import Settings
 from prefrl.fit.pairs import Batch, batch
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import dpo_loss, ipo_loss
-from prefrl.improve.writer import Writer
+from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguagePolicy, LanguageSettings
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, TextTask
@@ -39,7 +39,9 @@ class DirectSettings(Settings):
     beta: float = Field(0.1, gt=0)
     """How near: the reward that is implied is beta x the log-ratio to the starting policy."""
     learning_rate: float = Field(1e-4, gt=0)
-    """Adam's; it does not change."""
+    """Adam's."""
+    schedule: Schedule = "constant"
+    """Of the learning rate: it stays, or in each round it falls to 0 along a line over the round's gradient steps."""
     max_grad_norm: float = Field(1.0, gt=0)
     """A gradient that is longer is shortened to this."""
     asked_responses: int = Field(4, ge=2)
@@ -119,10 +121,10 @@ class Pairs:
         start = policy.start_logp(rows).sum(1)
         return cls(rows, start, data.edges, data.preference, data.weight, length_normalised)
 
-    def minibatches(self, epochs: int, size: int, rng: np.random.Generator) -> Iterator[Integers]:
+    def minibatches(self, epochs: int, size: int, rng: np.random.Generator) -> list[Integers]:
         """Indices of pairs: each pair once an epoch, about equally many at a time."""
-        for _ in range(epochs):
-            yield from np.array_split(rng.permutation(len(self)), -(-len(self) // size))
+        orders = [rng.permutation(len(self)) for _ in range(epochs)]
+        return [at for order in orders for at in np.array_split(order, -(-len(self) // size))]
 
     def gains(self, policy: LanguagePolicy, flat: Tensor) -> Tensor:
         """(b,) log-ratios of some responses to the starting policy, sums or means over tokens; differentiable."""

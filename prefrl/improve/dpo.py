@@ -52,5 +52,5 @@ def improve(
     """
     pairs = Pairs.of(judged(store, settings.kind), writer.policy, settings.length_normalised)
     minibatches = pairs.minibatches(settings.epochs, settings.minibatch, rng)
-    steps = [step(writer, settings, pairs, at, settings.pair_loss) for at in minibatches]
+    steps = [step(writer, settings, pairs, at, settings.pair_loss) for at in writer.paced(minibatches)]
     return means(steps) | {"pairs": float(len(pairs))}

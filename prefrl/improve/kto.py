@@ -79,7 +79,7 @@ def improve(
     if not len(data):
         raise ValueError("kto learns nothing from ties, and all judged pairs are: ask for more labels")
     pairs, seen = Pairs.of(data, writer.policy), []
-    for at in pairs.minibatches(settings.epochs, settings.minibatch, rng):
+    for at in writer.paced(pairs.minibatches(settings.epochs, settings.minibatch, rng)):
         point = reference_point(writer.policy, pairs, at)
         measured = step(writer, settings, pairs, at, partial(_loss, settings, point))
         seen.append(measured | {"reference_point": float(point)})

@@ -73,7 +73,7 @@ def improve(
     (tokens), ended (share), pairs (in a batch), equal_groups (share of prompts that give no pair), those of
     `prefrl.improve.direct.step`, and updates: batches that gave a pair at all.
     """
-    seen = [_update(settings, writer, reward, rng) for _ in range(settings.updates)]
+    seen = [_update(settings, writer, reward, rng) for _ in writer.paced(range(settings.updates))]
     return means(seen) | {"updates": float(sum(one["pairs"] > 0 for one in seen))}
 
 

@@ -47,7 +47,7 @@ class RAFTSettings(DirectSettings):
     beta: float = Field(0.0, ge=0)
     """Taken off a response's score for each nat of its log-ratio to the starting policy, before the best is chosen."""
     learning_rate: float = Field(5e-4, gt=0)
-    """Adam's; it does not change."""
+    """Adam's."""
     missing_end_penalty: float = Field(1.0, ge=0)
     """Taken off the score of a response that reached the task's most tokens without an end token."""
 
@@ -78,7 +78,7 @@ def improve(
     over gradient steps: loss (nats per token), grad_norm. NaN where it never was defined.
     """
     seen: dict[str, list[float]] = defaultdict(list)
-    for _ in range(settings.updates):
+    for _ in writer.paced(range(settings.updates)):
         drawn = writer.write(settings.prompts, settings.responses, rng)
         kept, measured = _choose(settings, writer.policy, drawn, reward)
         for metrics in (measured, *(_learn(settings, writer, drawn.rows(kept), rng) if len(kept) else ())):

@@ -29,7 +29,6 @@ from prefrl.improve.objectives import (
     all_equal,
     batch_centred,
     batch_scaled,
-    gae,
     group_normalised,
     kl_k1,
     kl_k3,
@@ -39,7 +38,8 @@ from prefrl.improve.objectives import (
     step_rewards,
     win_rates,
 )
-from prefrl.improve.writer import Writer
+from prefrl.improve.ppo import CriticSettings, by_token, start_from_reward
+from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
@@ -50,27 +50,12 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "rloo": {},
     "grpo": {"advantage": "group_normalised", "clip": 0.2, "kl_in": "advantage", "reduction": "sequence"},
     "reinforce": {"advantage": "batch_mean"},
-    "ppo": {"advantage": "gae", "clip": 0.2, "reduction": "token", "prompts": 128, "responses": 1, "epochs": 4},
+    "ppo": {"advantage": "gae", "clip": 0.2, "reduction": "token", "prompts": 128, "responses": 1, "epochs": 4}
+    | {"whiten": True},
 }
 """Where their defaults are others than those of the fields below."""
 RATIO_TOLERANCE = {torch.float32: 0.01, torch.bfloat16: 1.0, torch.float16: 0.3}
 """In half precision a decoding step rounds otherwise than a pass over all tokens."""
-
-
-class CriticSettings(Settings):
-    """What a value is expected from, and how it is learned."""
-
-    network: Literal["shared", "own"] = "shared"
-    """Whose hidden states the value is a linear function of: the policy's, which then learn from both losses, or those
-    of a network that starts as a copy of the policy."""
-    weight: float = Field(0.1, gt=0)
-    """Of the critic's loss beside the policy's."""
-    clip: float | None = Field(None, gt=0)
-    """How far a value may go in a batch before its loss no longer falls; null for the plain squared error."""
-    trace: float = Field(1.0, ge=0, le=1)
-    """GAE's lambda: 1 weighs whole returns, and is right whatever the critic has learned; 0 only the next token."""
-    whiten: bool = True
-    """Scale the batch's advantages to mean 0 and variance 1."""
 
 
 class TextLearnerSettings(Settings):
@@ -100,8 +85,11 @@ class TextLearnerSettings(Settings):
     """How far the ratio of new to old probability counts (PPO, GRPO); null for the plain policy gradient."""
     beta: float = Field(0.3, ge=0)
     """Weight of the KL to the starting policy (or to `reference_every`'s), in units of reward a nat."""
-    kl_in: Literal["reward", "advantage"] = "reward"
-    """Where the KL is taken off: the reward, before the baseline, or the advantage, after it was normalised."""
+    kl_in: Literal["reward", "advantage", "token"] = "reward"
+    """Where the KL is taken off: the reward, before the baseline; the advantage, after it was normalised; or the
+    advantage of each token, that of the tokens from it on, without a baseline (`token`, OpenRLHF's)."""
+    whiten: bool = False
+    """Scale the advantages to mean 0 and variance 1 over the tokens of a batch; PPO does unless told not to."""
     kl_target: float | None = Field(None, gt=0)
     """Steer beta to this KL in nats per response (Ziegler et al. 2019); null leaves it alone."""
     kl_stop: float | None = Field(None, gt=0)
@@ -116,7 +104,9 @@ class TextLearnerSettings(Settings):
     reduction: Reduction = "constant"
     """How steps are averaged: `constant` (sums over a response), `token` or `sequence` (see docs)."""
     learning_rate: float = Field(5e-4, gt=0)
-    """Adam's; it does not change."""
+    """Adam's."""
+    schedule: Schedule = "constant"
+    """Of the learning rate: it stays, or in each round it falls to 0 along a line over the round's gradient steps."""
     max_grad_norm: float = Field(1.0, gt=0)
     """A gradient that is longer is shortened to this."""
     temperature: float = Field(1.0, gt=0)
@@ -231,7 +221,9 @@ class TextLearner:
         `gradient.step`; ratio_error is the largest before a batch's first step: 0 to rounding.
         """
         seen: dict[str, list[float]] = defaultdict(list)
-        for _ in range(self._settings.updates):
+        if self._settings.critic.network == "reward" and not self._updates:
+            start_from_reward(self.policy, reward)
+        for _ in self._writer.paced(range(self._settings.updates)):
             drawn = self._writer.write(self._settings.prompts, self._settings.responses, rng)
             measured = self._update(drawn, reward, rng)
             for name, value in measured.items():
@@ -272,7 +264,7 @@ class TextLearner:
             scores = win_rates(scores.view(-1, settings.responses)).flatten()
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
-        batch, explained = (self._by_token if settings.advantage == "gae" else self._by_response)(drawn, scores, kl)
+        batch, explained = self._batch(drawn, scores, kl)
         minibatches, objective = self._minibatches(len(batch), rng), self._objective()
         with enough_memory("learner.policy.chunk", settings.policy.chunk):
             steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
@@ -295,32 +287,29 @@ class TextLearner:
             **self._equal_groups(scores),
         }
 
-    def _by_response(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
-        """The same advantage for all tokens of a response, from scores (B,) and the KL of each token (B, L)."""
+    def _batch(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
+        """What a gradient step is made of, from scores (B,) and the KL of each token (B, L)."""
+        settings = self._settings
+        if settings.advantage == "gae":
+            return by_token(self.policy, drawn, scores, kl, self._kl.beta, settings.critic.trace, settings.whiten)
+        known = drawn.mask & ~scores.isnan()[:, None]
+        advantages = self._by_response(drawn, scores, kl).view(-1, 1)
+        if settings.kl_in == "token":
+            following = kl.flip(1).cumsum(1).flip(1)  # (B, L): of each token and those after it
+            advantages = torch.where(known, advantages - self._kl.beta * following, 0.0)
+        if settings.whiten:
+            advantages = masked_whiten(advantages.expand_as(known), known)
+        return Batch(drawn, drawn.logp, advantages), {}
+
+    def _by_response(self, drawn: Responses, scores: Tensor, kl: Tensor) -> Tensor:
+        """(P, K): the same advantage for all tokens of a response."""
         settings = self._settings
         in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
         # (B,): one return a response, so the KL is in it before the baseline is taken off.
         returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
         groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
         kls = torch.where(scores.isnan(), math.nan, kl.sum(1)).view_as(groups)
-        advantages = advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
-        return Batch(drawn, drawn.logp, advantages.view(-1, 1)), {}
-
-    def _by_token(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
-        """An advantage for each token, by the critic, and what share of the returns' variance that explains."""
-        how, mask = self._settings.critic, drawn.mask
-        values = self.policy.all_values(drawn)  # (B, L)
-        rewards = step_rewards(scores.nan_to_num(), kl, mask, self._kl.beta)
-        following = torch.cat([values[:, 1:], torch.zeros_like(values[:, :1])], 1)  # 0 after the last token
-        # A response that was cut is over as well: its score is for what is there.
-        ends = mask & ~torch.cat([mask[:, 1:], torch.zeros_like(mask[:, :1])], 1)
-        advantages = gae(rewards, values, following, ends, 1.0, how.trace)
-        known = mask & ~scores.isnan()[:, None]
-        advantages = torch.where(known, advantages, 0.0)  # where nothing was scored the critic is held where it is
-        returns = values + advantages
-        explained = _explained(advantages[known], returns[known])
-        white = masked_whiten(advantages, known) if how.whiten else advantages
-        return Batch(drawn, drawn.logp, white, returns, values), {"explained": explained}
+        return advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
 
     def _equal_groups(self, scores: Tensor) -> Metrics:
         """The share of prompts whose responses all have the same score, where there are several."""
@@ -349,7 +338,7 @@ class TextLearner:
         With the same baseline, so that at the optimum of reward minus beta x KL both cancel in each sample.
         """
         settings = self._settings
-        if settings.kl_in == "reward" or not settings.beta:
+        if settings.kl_in != "advantage" or not settings.beta:
             return 0.0
         baseline = "batch_mean" if settings.advantage == "batch_mean" else "leave_one_out"
         return self._kl.beta * advantages_of(kls, baseline)
@@ -401,14 +390,6 @@ class TextLearner:
         return values
 
 
-def _explained(errors: Tensor, returns: Tensor) -> float:
-    """The share of the returns' variance that the critic foresaw; NaN where they do not vary."""
-    variance = float(returns.var(correction=0)) if len(returns) else 0.0
-    # By rounding returns that are all alike vary too.
-    alike = variance <= 1e-10 * float(returns.square().mean()) if variance else True
-    return math.nan if alike else 1.0 - float(errors.var(correction=0)) / variance
-
-
 def _mean(values: Sequence[float]) -> float:
     """Of the batches in which it is defined."""
     known = [value for value in values if not math.isnan(value)]
@@ -423,7 +404,6 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
     return scaled[how](returns)
 
 
-NETWORKS = {"shared": "the policy's hidden states", "own": "a network of its own"}
 AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
 ADVANTAGES = {
     "leave_one_out": "R_i - mean of the prompt's other R_j",
@@ -436,7 +416,7 @@ ADVANTAGES = {
 
 def text_formula(settings: TextLearnerSettings) -> str:
     """The objective in plain letters, with the settings' numbers."""
-    index = "A_t" if settings.advantage == "gae" else "A_i"
+    index = "A_t" if settings.advantage == "gae" or settings.kl_in == "token" else "A_i"
     gain = f"log pi(y_t) {index}"
     if settings.clip is not None:
         gain = f"min(r {index}, clip(r, {1 - settings.clip:g}, {1 + settings.clip:g}) {index})"
@@ -444,37 +424,33 @@ def text_formula(settings: TextLearnerSettings) -> str:
         f"maximise  {AVERAGES[settings.reduction]} [ {gain} ]",
         *(["r = pi(y_t) / pi_old(y_t)"] if settings.clip is not None else []),
         *([_moves(settings)] if settings.reference_every and settings.beta else []),
-        *(_by_token(settings) if settings.advantage == "gae" else _by_response(settings)),
+        *(_with_critic(settings) if settings.advantage == "gae" else _without_critic(settings)),
         f"{settings.prompts} prompts x {settings.responses} responses a batch, "
         f"{settings.epochs * settings.minibatches} gradient step(s) on each; temperature {settings.temperature:g}",
     ]
     return "\n".join(lines)
 
 
-def _by_response(settings: TextLearnerSettings) -> list[str]:
+def _with_critic(settings: TextLearnerSettings) -> list[str]:
+    penalty = f" - {_beta(settings)} [log pi_old(y_t) - log ref(y_t)]" if settings.beta else ""
+    return settings.critic.formula(penalty, _score(settings), settings.whiten)
+
+
+def _without_critic(settings: TextLearnerSettings) -> list[str]:
     apart = "sum_t [log pi_old(y_t) - log ref(y_t)]"
     others = "the batch's" if settings.advantage == "batch_mean" else "the prompt's other"
-    beside = f" - {_beta(settings)} (K_i - mean of {others} K_j),  K_i = {apart}"
-    after = beside if settings.beta and settings.kl_in == "advantage" else ""
+    after = {
+        "reward": "",
+        "advantage": f" - {_beta(settings)} (K_i - mean of {others} K_j),  K_i = {apart}",
+        "token": f" - {_beta(settings)} K_t,  K_t = {apart.replace('sum_t', 'sum_(s >= t)').replace('y_t', 'y_s')}",
+    }[settings.kl_in if settings.beta else "reward"]
     in_reward = f" - {_beta(settings)} {apart}" if settings.beta and not after else ""
-    advantage = f"A_i = {ADVANTAGES[settings.advantage]}{after}"
+    index = "A_t" if settings.kl_in == "token" else "A_i"
+    advantage = f"{index} = {ADVANTAGES[settings.advantage]}{after}{';  whitened' if settings.whiten else ''}"
     if settings.score == "raw":
         return [advantage, f"R_i = {_score(settings)}{in_reward}"]
     won = f"mean of s(x_i - x_j) over all of the prompt's {settings.responses},  s(d) = 1 / (1 + exp(-d))"
     return [advantage, f"R_i = w_i{in_reward},  w_i = {won}", f"x_i = {_score(settings)}"]
-
-
-def _by_token(settings: TextLearnerSettings) -> list[str]:
-    """With a critic: the score comes with a response's last token, T."""
-    how = settings.critic
-    kl = f" - {_beta(settings)} [log pi_old(y_t) - log ref(y_t)]" if settings.beta else ""
-    clip = "" if how.clip is None else f", V within {how.clip:g} of V_old"
-    return [
-        f"A_t = G_t{', whitened' if how.whiten else ''}",
-        f"G_t = sum_k {how.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]",
-        f"R_t = [t = T] {_score(settings)}{kl}",
-        f"minus {how.weight:g} mean_t [ (V(t) - G_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[how.network]}",
-    ]
 
 
 def _beta(settings: TextLearnerSettings) -> str:

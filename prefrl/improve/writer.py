@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from typing import Literal, Protocol, runtime_checkable
+from collections.abc import Iterator, Sequence
+from typing import Literal, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -17,11 +18,18 @@ from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Response, State, Steps
 
 
+T = TypeVar("T")
+Schedule: TypeAlias = Literal["constant", "linear"]
+
+
 class WriterSettings(Protocol):
     """What the settings of a learner of text say of its policy."""
 
     @property
     def learning_rate(self) -> float: ...
+
+    @property
+    def schedule(self) -> Schedule: ...
 
     @property
     def device(self) -> Device: ...
@@ -47,13 +55,14 @@ class Writer:
         settings: WriterSettings,
         rng: np.random.Generator,
         temperature: float = 1.0,
-        critic: Literal["shared", "own"] | None = None,
+        critic: Literal["shared", "own", "reward"] | None = None,
     ) -> None:
         """`temperature`: of sampling, and of every log-probability in the objective; `critic`: whose hidden states it
         reads, where there is one."""
+        self._rate, self._schedule = settings.learning_rate, settings.schedule
         self.policy = LanguagePolicy(task, temperature, settings.policy, rng)
         if critic is not None:
-            self.policy.add_critic(own=critic == "own")
+            self.policy.add_critic(own=critic != "shared")
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self.steps = Steps()
         self._gathered = self._gather() if self.policy.spread else {}
@@ -73,6 +82,14 @@ class Writer:
         drawn = self.policy.respond(self.policy.task.prompts(prompts, rng), each, rng)
         self.steps = self.steps.add(learn=drawn.count)
         return drawn
+
+    def paced(self, turns: Sequence[T]) -> Iterator[T]:
+        """A round's turns, each with the learning rate that the schedule has for it."""
+        for number, turn in enumerate(turns):
+            if self._schedule == "linear":
+                for group in self.optimizer.param_groups:
+                    group["lr"] = self._rate * (1 - number / len(turns))
+            yield turn
 
     def evaluate(self, prompts: int, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
         """One response at temperature 1 to each evaluation prompt; see `prefrl.evaluate.policies.responses`."""

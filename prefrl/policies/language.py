@@ -196,6 +196,18 @@ class LanguagePolicy:
         width = self.model.get_output_embeddings().weight.shape[1]  # type: ignore[no-untyped-call]
         self.critic = Critic(width, trunk, self._shortcuts)
 
+    def start_critic(self, trunk: State, weight: Tensor, bias: float) -> None:
+        """Let a critic with a network of its own go on from such weights, with a head (d,) and its bias.
+
+        Raises RuntimeError where names or shapes differ.
+        """
+        critic = self._critic()
+        assert critic.trunk is not None
+        critic.trunk.load_state_dict(trunk)
+        with torch.no_grad():
+            critic.head.weight.copy_(weight)  # (d,) -> (1, d)
+            critic.head.bias.fill_(bias)
+
     def respond(
         self, prompts: Sequence[str], samples: int, rng: np.random.Generator, sampling: Sampling | None = None
     ) -> Responses:

@@ -39,6 +39,7 @@ CLAIMING: dict[str, dict[str, Any]] = {
     "rloo, by win rates": {"score": "win_rate", "beta": BETA * (1 / (1 + math.exp(-1)) - 0.5)},
     "ppo": PPO,
     "ppo, its critic a network of its own": PPO | {"critic": {"network": "own"}},
+    "rloo, KL off each token, whitened": {"kl_in": "token", "whiten": True},
     "clipped, KL off the advantage": {"clip": 0.2, "epochs": 2, "minibatches": 2, "kl_in": "advantage"},
 }
 

@@ -337,6 +337,40 @@ def test_the_kl_does_not_teach_by_what_was_not_scored(toy_reviews: Reviews) -> N
     assert torch.equal(torch.as_tensor(one._kl_advantages(kls)), torch.zeros(1, 4))
 
 
+def test_a_kl_off_each_token_is_that_of_it_and_what_follows(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, kl_in="token", beta=0.5, prompts=1, responses=3)
+    rows = one.policy.respond(["The plot was"], 3, np.random.default_rng(0))
+    scores, kl = torch.tensor([1.0, 4.0, math.nan]), torch.where(rows.mask, 0.1, 0.0)
+    advantages = one._batch(rows, scores, kl)[0].advantages
+    for row, lead in ((0, -3.0), (1, 3.0)):
+        count = int(rows.mask[row].sum())
+        expected = torch.tensor([lead - 0.5 * 0.1 * (count - t) for t in range(count)])
+        torch.testing.assert_close(advantages[row, :count], expected)
+    assert not advantages[~rows.mask].any()
+    assert not advantages[2].any()
+
+
+def test_whitened_advantages_have_mean_0_and_variance_1_over_what_was_scored(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, whiten=True, beta=0.0)
+    rows = one.policy.respond(["The plot was"], 4, np.random.default_rng(0))
+    known = rows.mask & torch.tensor([True, True, True, False])[:, None]
+    scores, nothing = torch.tensor([1.0, 4.0, 2.0, math.nan]), torch.zeros_like(rows.logp)
+    advantages = one._batch(rows, scores, nothing)[0].advantages
+    assert float(advantages[known].mean()) == pytest.approx(0, abs=1e-5)
+    assert float(advantages[known].var(correction=0)) == pytest.approx(1, abs=1e-4)
+    assert not advantages[~known].any()
+    assert len(advantages[0, rows.mask[0]].unique()) == 1  # of a response they stay the same
+
+
+def test_a_linear_schedule_ends_each_round_at_0_and_begins_anew(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, schedule="linear", updates=4, learning_rate=0.04)
+    for _ in range(2):
+        rates = [one._writer.optimizer.param_groups[0]["lr"] for _ in one._writer.paced(range(4))]
+        assert rates == pytest.approx([0.04, 0.03, 0.02, 0.01])
+    one.improve(reward(), NO_STORE, np.random.default_rng(0))
+    assert one._writer.optimizer.param_groups[0]["lr"] == pytest.approx(0.01)
+
+
 @pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean", "gae"])
 def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
     """As if it had never been drawn: the others learn from one another alone."""
@@ -485,6 +519,9 @@ def test_the_formula_says_what_the_settings_say() -> None:
 def test_the_formula_says_what_is_done_to_a_score() -> None:
     shaped = text_formula(TextLearnerSettings(drop_unended=True, length_cost=0.1, reward_clip=2.0, beta=0.0))
     assert "R_i = clip(score(y_i), +-2) - 0.1 tokens(y_i), of responses with an end token alone" in shaped
+    token = text_formula(TextLearnerSettings(kl_in="token", beta=0.1, whiten=True))
+    assert "log pi(y_t) A_t" in token
+    assert "- 0.1 K_t,  K_t = sum_(s >= t) [log pi_old(y_s) - log ref(y_s)];  whitened" in token
     assert "the batch's K_j" in text_formula(TextLearnerSettings(advantage="batch_mean", kl_in="advantage"))
 
 

@@ -1,4 +1,4 @@
-"""The critic of a language model: values of what stands before a token, from the policy's states or from its own."""
+"""PPO for text: a critic's values of what stands before a token, and the advantages that come of them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
+from prefrl.improve.ppo import by_token, start_from_reward
 from prefrl.improve.text import TextLearner, TextLearnerSettings
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
+from prefrl.reward_models.text import TransformerReward, TransformerSettings
 from prefrl.types import Floats, Response
 
 NO_STORE = cast("Store[Response]", None)
@@ -111,11 +114,11 @@ def test_it_learns_what_is_to_come(toy_reviews: Reviews, network: str) -> None:
 
 
 def test_advantages_and_returns_by_hand(toy_reviews: Reviews) -> None:
-    one = learner(toy_reviews, critic={"trace": 0.5, "whiten": False}, beta=0.5)
+    one = learner(toy_reviews, critic={"trace": 0.5}, beta=0.5)
     with_head(one)
     rows = drawn(one, 2)
     scores, kl = torch.tensor([2.0, -1.0]), torch.where(rows.mask, 0.1, 0.0)
-    batch, _ = one._by_token(rows, scores, kl)
+    batch, _ = by_token(one.policy, rows, scores, kl, beta=0.5, trace=0.5, whiten=False)
     values = one.policy.all_values(rows)
     for row, count in enumerate(rows.mask.sum(1).tolist()):
         rewards = [-0.05] * (count - 1) + [float(scores[row]) - 0.05]
@@ -128,6 +131,46 @@ def test_advantages_and_returns_by_hand(toy_reviews: Reviews) -> None:
             assert float(batch.returns[row, t]) == pytest.approx(running + value, abs=1e-5)
             following = value
     assert not batch.advantages[~rows.mask].any()
+
+
+def test_a_critic_from_the_reward_model_begins_with_the_score_of_what_stands_there(toy_reviews: Reviews) -> None:
+    one, reward = learner(toy_reviews, "reward"), fitted(toy_reviews)
+    start_from_reward(one.policy, reward)
+    rows = drawn(one)
+    values = one.policy.all_values(rows)
+    whole = rows.candidates(toy_reviews.tokenizer)
+    for row, step in ((0, 1), (1, 2), (2, 3)):
+        before = replace(whole[row], tokens=whole[row].tokens[:step])
+        assert float(values[row, step]) == pytest.approx(float(reward.score([before])[0]), abs=1e-4)
+    assert values[rows.mask].std() > 0.01
+
+
+def fitted(task: Reviews, **settings: Any) -> TransformerReward:
+    """A reward model whose scores have a shift and a scale."""
+    reward = TransformerSettings(**settings).build(task, np.random.default_rng(3))
+    asked = task.prompts(4, np.random.default_rng(0))
+    policy = learner(task).policy
+    candidates = policy.respond(asked, 4, np.random.default_rng(1)).candidates(task.tokenizer)
+    reward.settle(reward.stack(candidates), lambda scores: scores.sum(1))
+    return reward
+
+
+def test_a_critic_starts_from_the_reward_model_once(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews, "reward", learning_rate=1e-9)
+    first = fitted(toy_reviews)
+    one.improve(first, NO_STORE, np.random.default_rng(0))
+    taken = head(one).clone()
+    torch.testing.assert_close(taken[0], first.mean_head()[0])
+    one.improve(cast("RewardModel[Response]", Lengths()), NO_STORE, np.random.default_rng(0))
+    torch.testing.assert_close(head(one), taken)
+
+
+@pytest.mark.parametrize("reward", [{"train": "lora"}, None])
+def test_a_critic_cannot_start_from_any_reward(toy_reviews: Reviews, reward: dict[str, Any] | None) -> None:
+    one = learner(toy_reviews, "reward")
+    found = LENGTHS if reward is None else fitted(toy_reviews, **reward)
+    with pytest.raises(ConfigError, match=r"critic\.network=reward"):
+        one.improve(found, NO_STORE, np.random.default_rng(0))
 
 
 def test_what_no_reward_scored_leaves_policy_and_critic_as_they_are(toy_reviews: Reviews) -> None:
