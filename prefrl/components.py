@@ -85,6 +85,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
+        "sft": "prefrl.improve.sft:SFTSettings",
         "text": "prefrl.improve.text:TextLearnerSettings",
     },
     "selectors": {

@@ -33,11 +33,9 @@ Improve: TypeAlias = Callable[[Writer, RewardModel[Response], Store[Response], n
 
 
 class DirectSettings(Settings):
-    """The settings that direct methods and RAFT have; each one's class adds its kind and what is particular to it."""
+    """The settings that all these learners have; each one's class adds its kind and what is particular to it."""
 
     kind: str
-    beta: float = Field(0.1, gt=0)
-    """How near: the reward that is implied is beta x the log-ratio to the starting policy."""
     learning_rate: float = Field(1e-4, gt=0)
     """Adam's."""
     schedule: Schedule = "constant"
@@ -58,7 +56,14 @@ class DirectSettings(Settings):
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
 
 
-class PairLossSettings(DirectSettings):
+class HeldSettings(DirectSettings):
+    """The settings of the methods that read gains."""
+
+    beta: float = Field(0.1, gt=0)
+    """How near: the reward that is implied is beta x the log-ratio to the starting policy."""
+
+
+class PairLossSettings(HeldSettings):
     """The settings of the methods whose loss is one of a pair."""
 
     loss: Literal["sigmoid", "ipo"] = "sigmoid"
@@ -141,7 +146,7 @@ def judged(store: Store[Response], kind: str) -> Batch[Response]:
     return data
 
 
-def step(writer: Writer, settings: DirectSettings, pairs: Pairs, at: Integers, loss: PairLoss) -> Metrics:
+def step(writer: Writer, settings: HeldSettings, pairs: Pairs, at: Integers, loss: PairLoss) -> Metrics:
     """One gradient step on some pairs.
 
     Metrics, weighted means over pairs: loss, accuracy (share whose better one gained more; a tie is half), margin (beta
@@ -153,7 +158,7 @@ def step(writer: Writer, settings: DirectSettings, pairs: Pairs, at: Integers, l
     return descend(policy.parameters(), writer.optimizer, parts, settings.max_grad_norm)
 
 
-def _parts(policy: LanguagePolicy, settings: DirectSettings, pairs: Pairs, at: Integers, loss: PairLoss) -> Parts:
+def _parts(policy: LanguagePolicy, settings: HeldSettings, pairs: Pairs, at: Integers, loss: PairLoss) -> Parts:
     """Both responses of a pair go through the network in one pass, so that their rounding is alike."""
     for some in in_parts(at, settings.policy.chunk // 2):
         # Shares of the whole minibatch: the parts add up to its mean. The two of a pair stand side by side: (2 m,).
@@ -173,7 +178,8 @@ def means(seen: list[Metrics]) -> Metrics:
 
 
 class Direct:
-    """A `prefrl.protocols.Learner` of responses. Direct methods and RAFT are one but for how they improve."""
+    """A `prefrl.protocols.Learner` of responses: direct methods, RAFT and supervised fine-tuning differ in how they
+    improve alone."""
 
     def __init__(self, settings: DirectSettings, task: TextTask, improve: Improve, rng: np.random.Generator) -> None:
         self._settings, self._writer, self._improve = settings, Writer(task, settings, rng), improve

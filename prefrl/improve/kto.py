@@ -18,7 +18,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from prefrl.improve.direct import Direct, DirectSettings, Pairs, judged, means, step
+from prefrl.improve.direct import Direct, HeldSettings, Pairs, judged, means, step
 from prefrl.improve.objectives import kto_loss
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguagePolicy
@@ -29,7 +29,7 @@ from prefrl.protocols import RewardModel, Store, Task, text
 from prefrl.types import Integers, Metrics, Response
 
 
-class KTOSettings(DirectSettings):
+class KTOSettings(HeldSettings):
     """Kahneman-Tversky optimisation on all judgements so far, held near the starting policy."""
 
     kind: Literal["kto"] = "kto"

@@ -44,15 +44,16 @@ class CriticSettings(Settings):
     trace: float = Field(1.0, ge=0, le=1)
     """GAE's lambda: 1 weighs whole returns, and is right whatever the critic has learned; 0 only the next token."""
 
-    def formula(self, penalty: str, score: str, whitened: bool) -> list[str]:
-        """The advantages in plain letters, from those of a token's KL and of a score that comes with the last one."""
-        clip = "" if self.clip is None else f", V within {self.clip:g} of V_old"
-        return [
-            f"A_t = G_t{', whitened' if whitened else ''}",
-            f"G_t = sum_k {self.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]",
-            f"R_t = [t = T] {score}{penalty}",
-            f"minus {self.weight:g} mean_t [ (V(t) - G_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[self.network]}",
-        ]
+
+def critic_formula(how: CriticSettings, penalty: str, score: str, whitened: bool) -> list[str]:
+    """The advantages in plain letters: `penalty` for the KL of a token, and a score that comes with the last one."""
+    clip = "" if how.clip is None else f", V within {how.clip:g} of V_old"
+    return [
+        f"A_t = G_t{', whitened' if whitened else ''}",
+        f"G_t = sum_k {how.trace:g}^k [R_(t+k) + V_old(t+k+1) - V_old(t+k)]",
+        f"R_t = [t = T] {score}{penalty}",
+        f"minus {how.weight:g} mean_t [ (V(t) - G_t - V_old(t))^2 / 2 ]{clip};  V from {NETWORKS[how.network]}",
+    ]
 
 
 def by_token(

@@ -20,14 +20,14 @@ from torch import Tensor
 from prefrl.evaluate.best_of_n import best
 from prefrl.evaluate.policies import scored
 from prefrl.improve.direct import Direct, DirectSettings
-from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import kl_k1
+from prefrl.improve.sft import shuffled, supervised
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguagePolicy
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, text
 from prefrl.seeding import to_numpy
-from prefrl.types import Integers, Metrics, Response
+from prefrl.types import Metrics, Response
 
 
 class RAFTSettings(DirectSettings):
@@ -105,15 +105,5 @@ def _choose(
 
 
 def _learn(settings: RAFTSettings, writer: Writer, rows: Responses, rng: np.random.Generator) -> Iterator[Metrics]:
-    policy = writer.policy
     for _ in range(settings.epochs):
-        for at in np.array_split(rng.permutation(len(rows)), -(-len(rows) // settings.minibatch)):
-            if len(at) >= policy.least_rows:  # else there are too few for all ranks
-                parts = _parts(settings, policy, rows, at)
-                yield descend(policy.parameters(), writer.optimizer, parts, settings.max_grad_norm)
-
-
-def _parts(settings: RAFTSettings, policy: LanguagePolicy, rows: Responses, at: Integers) -> Parts:
-    tokens = rows.mask[torch.from_numpy(at).to(policy.device)].sum()  # the whole minibatch's: its mean is in parts
-    for some in in_parts(at, settings.policy.chunk):
-        yield -policy.log_prob(rows.rows(torch.from_numpy(some).to(policy.device)))[0].sum() / tokens, {}
+        yield from supervised(writer, settings, rows, shuffled(len(rows), settings.minibatch, rng))

@@ -38,7 +38,7 @@ from prefrl.improve.objectives import (
     step_rewards,
     win_rates,
 )
-from prefrl.improve.ppo import CriticSettings, by_token, start_from_reward
+from prefrl.improve.ppo import CriticSettings, by_token, critic_formula, start_from_reward
 from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
@@ -433,7 +433,7 @@ def text_formula(settings: TextLearnerSettings) -> str:
 
 def _with_critic(settings: TextLearnerSettings) -> list[str]:
     penalty = f" - {_beta(settings)} [log pi_old(y_t) - log ref(y_t)]" if settings.beta else ""
-    return settings.critic.formula(penalty, _score(settings), settings.whiten)
+    return critic_formula(settings.critic, penalty, _score(settings), settings.whiten)
 
 
 def _without_critic(settings: TextLearnerSettings) -> list[str]:

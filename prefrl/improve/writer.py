@@ -17,7 +17,6 @@ from prefrl.protocols import RewardModel, TextTask
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Response, State, Steps
 
-
 T = TypeVar("T")
 Schedule: TypeAlias = Literal["constant", "linear"]
 
