@@ -14,6 +14,7 @@ from typing import Generic
 from pydantic import Field
 
 from prefrl.components import Settings
+from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
 from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
 from prefrl.seeding import Streams, streams
@@ -72,6 +73,7 @@ class Loop(Generic[C]):
     """What is going on, for whoever watches."""
     _seconds: Metrics = field(default_factory=dict)
     _notes: list[str] = field(default_factory=list)
+    _warned: set[str] = field(default_factory=set)
 
     def run(self) -> Iterator[Round[C]]:
         """Go on from where the loop stands to the last round."""
@@ -165,11 +167,17 @@ class Loop(Generic[C]):
         }
         if not self.reward.fitted:
             stages["evaluate"].pop("learned", None)  # what an unfitted network says means nothing
-        notes = tuple(self._notes)
+        metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
+        notes = (*self._notes, *self._warnings(number, metrics))
         self.sequence = self.store.sequence
         self.round, self._seconds, self._notes, self.stage = number, {}, [], "idle"
-        metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
         return Round(number, metrics, evaluated.examples, fitted, notes)
+
+    def _warnings(self, number: int, metrics: Metrics) -> list[str]:
+        """What the round's numbers warn of, each thing once."""
+        new = {name: text for name, text in warnings(number, metrics).items() if name not in self._warned}
+        self._warned |= set(new)
+        return list(new.values())
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:

@@ -28,6 +28,7 @@ LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "rloo": ("text", {"updates": 1, "prompts": 2, "responses": 2}),
     "grpo": ("text", {"algorithm": "grpo", "updates": 1, "prompts": 2, "responses": 2, "minibatches": 2}),
     "raft": ("raft", {"updates": 1, "prompts": 2, "responses": 2}),
+    "sft": ("sft", {"asked_responses": 2, "minibatch": 2}),
     "dpo": ("dpo", {"asked_responses": 2, "minibatch": 2}),
     "kto": ("kto", {"asked_responses": 2, "minibatch": 2}),
     "online_dpo": ("online_dpo", {"asked_responses": 2, "updates": 1, "prompts": 4}),

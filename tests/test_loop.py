@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from runs import tiny
 
 from prefrl import Config
 from prefrl.config import presets
@@ -18,6 +17,7 @@ from prefrl.protocols import Store
 from prefrl.stages import shrink
 from prefrl.store import Store as SQLStore
 from prefrl.types import Query
+from runs import tiny
 
 TOYS = ["control/toy", "text/toy"]
 
@@ -256,3 +256,19 @@ def test_rankings_of_several_candidates_go_through_the_loop(tmp_path: Path) -> N
     judgements = [j.judgement for j in loop.store.judged()]
     assert all(isinstance(j, Ranking) for j in judgements)
     assert last.metrics["fit/comparisons"] == 3 * len(judgements)
+
+
+def test_a_warning_is_said_once(tmp_path: Path) -> None:
+    class Constant:
+        fitted, members = True, 1
+
+        def score(self, candidates: Sequence[Any]) -> np.ndarray:
+            return np.ones(len(candidates), np.float32)
+
+    loop = build(
+        "text/toy", tmp_path, "loop.labels=0", "loop.rounds=2", "learner.missing_end_penalty=0", "learner.beta=0"
+    )
+    loop.reward = Constant()  # type: ignore[assignment]  # as much of a reward model as a loop without labels reads
+    loop._fit = lambda rng, pool: None  # type: ignore[method-assign]
+    notes = [[note for note in round.notes if "is it constant?" in note] for round in loop.run()]
+    assert [len(found) for found in notes] == [0, 1, 0]

@@ -1,0 +1,26 @@
+"""Warnings from a round's numbers: each where it is due, and nowhere else."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from prefrl.evaluate.health import warnings
+
+
+@pytest.mark.parametrize(
+    ("round", "metrics", "warned"),
+    [
+        (3, {"improve/explained": 0.01}, ["critic"]),
+        (3, {"improve/explained": -0.5}, ["critic"]),
+        (3, {"improve/explained": 0.3}, []),
+        (2, {"improve/explained": 0.01}, []),  # it is still new
+        (9, {"improve/explained": math.nan}, []),
+        (1, {"improve/equal_groups": 1.0}, ["reward"]),
+        (1, {"improve/equal_groups": 0.99}, []),
+        (9, {}, []),
+    ],
+)
+def test_what_is_wrong_is_said(round: int, metrics: dict[str, float], warned: list[str]) -> None:
+    assert list(warnings(round, metrics)) == warned
