@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from itertools import accumulate
+from itertools import accumulate, takewhile
 
 import numpy as np
 
@@ -54,6 +54,11 @@ class Grammar:
         """Could the grammar have written exactly this text, capitals and spaces included?"""
         words = _TOKEN.findall(text.lower())
         return render(words) == text and len(words) in self._ends(f"<{self.start}>", 0, words, {})
+
+    def phrases(self, ending: str) -> tuple[str, ...]:
+        """How each alternative of the rules whose names end so begins, up to the first name in it; lower-case."""
+        ways = [way for name, rule in self.rules.items() if name.endswith(ending) for way in rule.alternatives]
+        return tuple(" ".join(takewhile(lambda item: not item.startswith("<"), way)) for way in ways)
 
     @cached_property
     def literals(self) -> frozenset[str]:

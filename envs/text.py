@@ -1,4 +1,4 @@
-"""The text task: write a review that begins with a given prompt. The gold is how positive it is (VADER)."""
+"""The text task: write a review that begins with a given prompt. The gold is how positive it is, or a rubric."""
 
 from __future__ import annotations
 
@@ -24,10 +24,17 @@ SHIPPED = Path(__file__).parent / "starts" / "reviews"
 """The starting policy of the default settings; `benchmarks/start_reviews.py` makes it."""
 
 
+PRAISE = 0.5
+"""VADER's compound score from which a review is taken to praise."""
+
+
 class ReviewsSettings(Settings):
-    """Short reviews of films, meals, hotels, books and gadgets; the gold is VADER's compound score."""
+    """Short reviews of films, meals, hotels, books and gadgets; the gold is VADER's compound score, or a rubric."""
 
     kind: Literal["reviews"] = "reviews"
+    gold: Literal["sentiment", "rubric"] = "sentiment"
+    """What a review is worth: VADER's compound score, or the share of four things that it does (`rubric`): it praises,
+    tells what happened, recommends, and exclaims. Fewer than one in a hundred of the start's reviews do all four."""
     response_tokens: int = Field(48, ge=2)
     """The most tokens that a response may have, the end token included."""
     cloning: CloningSettings = CloningSettings()
@@ -60,6 +67,8 @@ class Reviews:
         self.ends = (int(tokenizer.eos_token_id),)
         self._model = model
         self._grammar = grammar
+        self._worth = {"sentiment": self._sentiment, "rubric": self._rubric}[settings.gold]
+        self._told, self._advised = grammar.phrases("fact_good"), grammar.phrases("advise_good")
         self._vader = SentimentIntensityAnalyzer()
 
     def model(self, frozen: bool = False) -> LlamaForCausalLM:
@@ -79,17 +88,26 @@ class Reviews:
         return self._draw(count, rng, evaluation=True)
 
     def gold(self, responses: Sequence[Response]) -> Floats:
-        """(N,) VADER's compound score in [-1, 1] (Hutto and Gilbert 2014) of the whole review.
+        """(N,) VADER's compound score in [-1, 1] (Hutto and Gilbert 2014) of the whole review; or, by the rubric, the
+        share of what it does, in [0, 1].
 
         The prompt is scored along, since a reader sees it and VADER's negations reach across its end; on their own
         all prompts score 0.
         """
-        scores = [self._vader.polarity_scores(r.prompt + r.text)["compound"] for r in responses]
-        return np.array(scores, np.float32)
+        return np.array([self._worth(r) for r in responses], np.float32)
 
     def fluency(self, responses: Sequence[Response]) -> Floats:
         """(N,) 1 where the grammar could have written prompt and response, to the last full stop, else 0."""
         return np.array([self._grammar.accepts(r.prompt + r.text) for r in responses], np.float32)
+
+    def _sentiment(self, response: Response) -> float:
+        return float(self._vader.polarity_scores(response.prompt + response.text)["compound"])
+
+    def _rubric(self, response: Response) -> float:
+        said = response.text.lower()
+        praises, exclaims = self._sentiment(response) >= PRAISE, "!" in said
+        told, advised = (any(phrase in said for phrase in phrases) for phrases in (self._told, self._advised))
+        return (praises + told + advised + exclaims) / 4
 
     def _draw(self, count: int, rng: np.random.Generator, evaluation: bool) -> list[str]:
         found: list[str] = []

@@ -466,5 +466,6 @@ def _score(settings: TextLearnerSettings) -> str:
     """What is learned from of a response's score."""
     score = "score(y_i)" if settings.reward_clip is None else f"clip(score(y_i), +-{settings.reward_clip:g})"
     cost = f" - {settings.length_cost:g} tokens(y_i)" if settings.length_cost else ""
-    end = "" if settings.drop_unended else f" - {settings.missing_end_penalty:g} [no end token]"
+    penalised = settings.missing_end_penalty and not settings.drop_unended
+    end = f" - {settings.missing_end_penalty:g} [no end token]" if penalised else ""
     return score + end + cost + (", of responses with an end token alone" if settings.drop_unended else "")

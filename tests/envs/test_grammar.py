@@ -38,6 +38,12 @@ def test_anything_else_is_not_accepted(text: str) -> None:
     assert not parse(SMALL, "review").accepts(text)
 
 
+def test_phrases_are_how_alternatives_begin() -> None:
+    grammar = parse("a = one <b> two | three\nb_x = four | five six\nb = <b_x>", "a")
+    assert grammar.phrases("a") == ("one", "three")
+    assert grammar.phrases("_x") == ("four", "five six")
+
+
 def test_weights_are_relative_frequencies() -> None:
     grammar, rng = parse(SMALL, "review"), np.random.default_rng(0)
     share = np.mean([grammar.sample(rng)[0].startswith("Ann") for _ in range(2000)])

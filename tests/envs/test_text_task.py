@@ -5,7 +5,7 @@ import torch
 from transformers import PreTrainedTokenizerBase
 
 from prefrl.envs.reviews import reviews
-from prefrl.envs.text import Reviews
+from prefrl.envs.text import Reviews, ReviewsSettings
 from prefrl.types import Response
 
 REVIEWS = reviews()
@@ -46,6 +46,22 @@ def test_the_gold_reads_prompt_and_response_together(toy_reviews: Reviews) -> No
         < 0
         < toy_reviews.gold([Response("I", " like it.")])[0]
     )
+
+
+def test_the_rubric_counts_what_a_review_does(rng: np.random.Generator) -> None:
+    small = ReviewsSettings(gold="rubric").shrunk()
+    assert isinstance(small, ReviewsSettings)
+    task = small.build()
+    said = {
+        " really dull. avoid it if you can.": 0.0,
+        " really dull! never again!": 0.25,
+        " wonderful. every bite was a joy.": 0.5,
+        " wonderful. every bite was a joy. I recommend it to anyone.": 0.75,
+        " wonderful! every bite was a joy. I recommend it to anyone.": 1.0,
+    }
+    assert task.gold([Response("The soup was", text) for text in said]).tolist() == list(said.values())
+    written = task.gold([Response(*REVIEWS.sample(rng)) for _ in range(4000)])
+    assert 0 < (written == 1).mean() < 0.01
 
 
 def test_fluency_is_one_for_the_grammar_s_own_and_zero_for_word_salad(
