@@ -1,6 +1,7 @@
 """A learner of text against best-of-n, at the same distance from the start and by the same reward model.
 
-    python benchmarks/text_best_of_n.py text/reviews [--learner rloo|grpo|raft|dpo] [--seeds 5] [--first 100] [--short]
+    python benchmarks/text_best_of_n.py TASK [--learner rloo|grpo|ppo|raft|online_dpo|dpo] [--seeds 5] [--first 100]
+        [--set KEY=VALUE] [--prompts 128] [--pool 64] [--short]
 
 Runs the learner's preset for each seed, in runs/best-of-n/, where a run that is there already is taken up. Its newest
 reward model then chooses among a pool of responses that the starting policy writes to the evaluation's prompts; from
@@ -38,7 +39,7 @@ PRESETS = {"ppo": "-ppo", "raft": "-raft", "online_dpo": "-online-dpo", "dpo": "
 """Learners with a preset of their own; the others are algorithms of the task's."""
 RESAMPLES, FEW = 9999, 5
 AT_ONCE = 4
-SHOWN = (1, 2, 4, 8, 16, 32, 64)
+SHOWN = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=100, help="the first seed")
     parser.add_argument("--out", type=Path, default=Path("runs/best-of-n"))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the runs")
+    parser.add_argument("--prompts", type=int, default=Size.prompts, help="of the comparison")
+    parser.add_argument("--pool", type=int, default=Size.pool, help="responses to each; best-of-n is known up to it")
     parser.add_argument("--short", action="store_true", help="two small runs")
     options = parser.parse_args()
-    size, seeds = (SHORT, 2) if options.short else (Size(), options.seeds)
+    size, seeds = (SHORT, 2) if options.short else (Size(options.prompts, options.pool), options.seeds)
     size = replace(size, settings=(*options.set, *size.settings))
     rows = []
     for seed in range(options.first, options.first + seeds):
@@ -79,7 +82,7 @@ def finished(task: str, learner: str, seed: int, size: Size, out: Path) -> Path:
         settings.append(f"learner.algorithm={learner}")
     if learner == "dpo":
         settings = [one for one in settings if not one.startswith("learner.updates")]
-    short = "-short" if size.pool < Size.pool else ""
+    short = "-short" if size.pool == SHORT.pool else ""
     folder = out / f"{task.replace('/', '-')}-{learner}{short}-{seed}"
     command = [sys.executable, "-m", "prefrl", "run", preset, *settings, "--out", str(folder)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
