@@ -207,6 +207,26 @@ class Labeler(Protocol[C]):
         """Answer open queries of the store: all of them now (an oracle), or as far as people have come."""
 
 
+class Verdict(Protocol):
+    """The answers to one pair of candidates, shown in both orders; NaN where there is none."""
+
+    @property
+    def forward(self) -> float:
+        """The probability that the first is better, where it was shown first."""
+
+    @property
+    def backward(self) -> float:
+        """The same, where it was shown second."""
+
+
+@runtime_checkable
+class Swapping(Protocol[C_contra]):
+    """A labeler that shows each pair in both orders by itself, so that nobody has to ask it twice."""
+
+    def compare(self, pairs: Sequence[tuple[C_contra, C_contra]], /) -> Sequence[Verdict]:
+        """Judge pairs of candidates of one context."""
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 
@@ -445,8 +465,10 @@ __all__ = [
     "SelectorSettings",
     "StepRewardModel",
     "Store",
+    "Swapping",
     "Task",
     "TaskSettings",
     "TextTask",
     "Transition",
+    "Verdict",
 ]

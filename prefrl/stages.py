@@ -107,7 +107,7 @@ def read_queries(path: Path, task: Any) -> list[Query[Response]]:
     queries = []
     for number, line in enumerate(read_lines(path), 1):
         try:
-            queries.append(Query(tuple(_with_gold(_responses(json.loads(line)), task))))
+            queries.append(Query(tuple(with_gold(_responses(json.loads(line)), task))))
         except ValueError as error:
             raise ValueError(f"{path}: row {number}: {error}") from error
     if not queries:
@@ -125,7 +125,7 @@ def _responses(row: Any) -> list[Response]:
     return [Response(prompt, text) for text in texts]
 
 
-def _with_gold(responses: list[Response], task: Any) -> list[Response]:
+def with_gold(responses: list[Response], task: Any) -> list[Response]:
     """Attach the hidden gold, for oracles."""
     gold = task.gold(responses)
     return [replace(r, gold=np.array([g])) for r, g in zip(responses, gold, strict=True)]
@@ -173,8 +173,8 @@ def export_classifier(saved: Path, to: Path) -> float:
     return save_classifier(reward.backbone, *reward.mean_head(), to)
 
 
-def policy_of(folder: Path) -> LanguagePolicy:
-    """The newest policy of a run of text. Raises `RunError` where the run has none."""
+def policy_of(folder: Path, at_start: bool = False) -> LanguagePolicy:
+    """The newest policy of a run of text, or the one that it started from. Raises `RunError` where it has none."""
     from prefrl.improve.writer import WritesText
     from prefrl.policies.language import LanguagePolicy
 
@@ -182,6 +182,8 @@ def policy_of(folder: Path) -> LanguagePolicy:
     learner = saved.config.build_learner(saved.config.build_task(), streams(saved.config.seed, 0).build)
     if not isinstance(learner, WritesText) or not isinstance(learner.policy, LanguagePolicy):
         raise RunError(f"{folder}: its policy is no language model; expected a run of a text task")
+    if at_start:
+        return learner.policy
     try:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
@@ -206,7 +208,7 @@ def generate(
     policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int = 0, batch: int = 16
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Each prompt with a policy's responses, `batch` prompts at a time."""
-    for prompt, found in _answered(policy, texts, sampling, seed, batch):
+    for prompt, found in answered(policy, texts, sampling, seed, batch):
         yield prompt, tuple(one.text for one in found)
 
 
@@ -222,7 +224,7 @@ def generate_best(
 
     What is not scored never wins; where nothing is, it is the first, and its score None.
     """
-    for prompt, found in _answered(policy, texts, sampling, seed, batch):
+    for prompt, found in answered(policy, texts, sampling, seed, batch):
         scores = reward.score(found)
         at = int(best(scores))
         yield prompt, found[at].text, None if np.isnan(scores[at]) else float(scores[at])
@@ -232,13 +234,14 @@ def reward_of(folder: Path, task: TextTask) -> RewardModel[Response]:
     """The newest reward model of a run of text. Raises `RunError` where nothing was fitted yet."""
     reward: RewardModel[Response] = open_saved(folder).reward(task)
     if not reward.fitted:
-        raise RunError(f"{folder}: its reward model was not fitted yet, and cannot tell which response is the best")
+        raise RunError(f"{folder}: its reward model was not fitted yet, and cannot tell which response is better")
     return reward
 
 
-def _answered(
-    policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int, batch: int
+def answered(
+    policy: LanguagePolicy, texts: Sequence[str], sampling: Drawn, seed: int = 0, batch: int = 16
 ) -> Iterator[tuple[str, list[Response]]]:
+    """Each prompt with a policy's responses as they were sampled, `batch` prompts at a time."""
     how = replace(policy.sampling(sampling.samples, sampling.temperature), top_k=sampling.top_k, top_p=sampling.top_p)
     for start in range(0, len(texts), batch):
         some = texts[start : start + batch]

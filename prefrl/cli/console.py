@@ -25,6 +25,8 @@ from prefrl.report import card_words
 from prefrl.types import Fields, Round
 
 if TYPE_CHECKING:
+    from prefrl.duel import Duel
+    from prefrl.evaluate.win_rate import WinRate
     from prefrl.rundir import Run
 
 console = Console(highlight=False)
@@ -191,6 +193,28 @@ def summary_table(summary: Fields) -> Table:
 def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
     """Names and numbers."""
     return table(title, ("metric", "value"), [(name, number(value)) for name, value in metrics.items()])
+
+
+def win_rate_line(duel: Duel, found: WinRate) -> str:
+    """Who won how often, and how sure that is, in a sentence."""
+    rate, other = found.rate, f"that of {duel.against}" if duel.against else "its start"
+    if rate.value is None:
+        return f"the policy of {duel.folder} against {other}, by {duel.who}: no pair was judged"
+    between = f" [{rate.low:.1%}, {rate.high:.1%}]".replace("%", "") if None not in (rate.low, rate.high) else ""
+    many = f"{found.prompts} prompts" if duel.samples == 1 else f"{found.pairs} pairs, to {found.prompts} prompts,"
+    return (
+        f"the policy of {duel.folder} wins {100 * rate.value:.1f} %{between} of {many} against {other}, by {duel.who}"
+    )
+
+
+def win_rate_table(found: WinRate) -> Table:
+    """What a win rate rests on."""
+    rows: dict[str, float | None] = {"wins": found.wins, "ties": found.ties, "losses": found.losses}
+    rows |= {"unjudged": found.unjudged, "prompts": found.prompts, "tokens": found.tokens}
+    rows |= {"the other's tokens": found.other_tokens, "share won by the longer one": found.longer_won.value}
+    if found.order is not None:
+        rows |= {"position bias": found.order.position_bias, "share whose winner flipped": found.order.flipped}
+    return table("pairs of responses", ("what", "value"), [(name, number(value)) for name, value in rows.items()])
 
 
 def card_table(card: ReportCard) -> Table:

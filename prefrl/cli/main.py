@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from datetime import datetime
+from enum import StrEnum
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,6 +36,14 @@ app.add_typer(store_commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
 Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
+
+
+class By(StrEnum):
+    """Who says which response is better."""
+
+    reward = "reward"
+    gold = "gold"
+    labeler = "labeler"
 
 
 FEW = 20
@@ -202,6 +211,47 @@ def evaluate(
         console.print(metrics_table(f"policy of {folder}", stages.evaluate(folder).metrics))
     else:
         raise typer.BadParameter("say what to evaluate: a run's FOLDER, or --reward FOLDER")
+
+
+@app.command()
+def win_rate(
+    folder: Folder,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(help="With --by labeler: its settings, as labeler.key=value.", show_default=False),
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Another run; default: the policy that the run started from.", exists=True)
+    ] = None,
+    by: Annotated[By, typer.Option(help="Who says which response is better.")] = By.reward,
+    reward: Annotated[
+        Path | None, typer.Option(help="With --by reward: a run, or what `prefrl fit` wrote; default: the run's own.")
+    ] = None,
+    prompts: Annotated[
+        Path | None,
+        typer.Option(help="A file or a data set of prompts; default: the evaluation's.", exists=True),
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option(help="So many distinct prompts; default: 256, or all of a file.", min=1)
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Responses to each prompt, on either side.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Of prompts and responses.", min=0)] = 0,
+    json_: Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")] = None,
+) -> None:
+    """Say how often the newest policy of a text run beats its start, or another run's policy."""
+    from prefrl.cli.console import console, counted, say, win_rate_line, win_rate_table
+    from prefrl.duel import Duel
+    from prefrl.storage.files import write_file
+
+    _refuse(bool(overrides) and by is not By.labeler, "settings of a labeler go with --by labeler")
+    _refuse(reward is not None and by is not By.reward, "--reward goes with --by reward")
+    settings = tuple(overrides or ())
+    duel = Duel(folder, against, by.value, reward, settings, prompts, count, samples, seed)
+    found = duel.outcome(lambda items, total: counted(items, total, "prompts"), say)
+    say(win_rate_line(duel, found), "bold")
+    console.print(win_rate_table(found))
+    if json_ is not None:
+        write_file(json_, json.dumps(duel.record(found), indent=1).encode())
 
 
 @app.command()

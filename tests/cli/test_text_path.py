@@ -124,7 +124,7 @@ def test_of_several_responses_the_best_by_the_reward_is_written(
     reward = stages.reward_of(run, policy.task)
     how = stages.Drawn(samples=4)
     for pool, row, (_, found) in zip(
-        pools, chosen, stages._answered(policy, ["The plot was", "The plot is"], how, 0, 16), strict=True
+        pools, chosen, stages.answered(policy, ["The plot was", "The plot is"], how, 0, 16), strict=True
     ):
         scores = reward.score(found)
         assert [one.text for one in found] == pool["responses"]  # the same are drawn
