@@ -4,8 +4,8 @@
         [--short]
 
 The task is the rubric of reviews, which fewer than one in a hundred of the start's responses meet, with 300 comparisons
-in four rounds. Learners that write have 30 batches of 128 responses a round. A point is an evaluation after a round: the
-mean over seeds. Best-of-n is by the reward model of the first RLOO run, as in text_best_of_n.py. Finished runs are
+in four rounds. Learners that write have 30 batches of 128 responses in each. A point is an evaluation after a round,
+the mean over seeds. Best-of-n is by the reward model of the first RLOO run, as in text_best_of_n.py. Finished runs are
 taken up. Writes TO.csv and TO.svg; the last line is one JSON object: for each learner where it ended.
 """
 
