@@ -60,12 +60,17 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=100, help="the first seed")
     parser.add_argument("--out", type=Path, default=Path("runs/best-of-n"))
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the runs")
+    parser.add_argument("--run", type=Path, help="a finished run, or what `prefrl improve` wrote: that one alone")
     parser.add_argument("--prompts", type=int, default=Size.prompts, help="of the comparison")
     parser.add_argument("--pool", type=int, default=Size.pool, help="responses to each; best-of-n is known up to it")
     parser.add_argument("--short", action="store_true", help="two small runs")
     options = parser.parse_args()
     size, seeds = (SHORT, 2) if options.short else (Size(options.prompts, options.pool), options.seeds)
     size = replace(size, settings=(*options.set, *size.settings))
+    if options.run:
+        found = compared(options.run, options.first, size)
+        print({name: np.round(value, 3).tolist() for name, value in found.items() if name != "n"})
+        return
     rows = []
     for seed in range(options.first, options.first + seeds):
         folder = finished(options.task, options.learner, seed, size, options.out)
