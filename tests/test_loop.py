@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from runs import tiny
 
 from prefrl import Config
 from prefrl.config import presets
@@ -17,7 +18,6 @@ from prefrl.protocols import Store
 from prefrl.stages import shrink
 from prefrl.store import Store as SQLStore
 from prefrl.types import Query
-from runs import tiny
 
 TOYS = ["control/toy", "text/toy"]
 
