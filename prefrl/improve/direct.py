@@ -39,7 +39,8 @@ class DirectSettings(Settings):
     learning_rate: float = Field(1e-4, gt=0)
     """Adam's."""
     schedule: Schedule = "constant"
-    """Of the learning rate: it stays, or in each round it falls to 0 along a line over the round's gradient steps."""
+    """Of the learning rate: it stays, or it falls towards 0 along a line over the batches of a round (over the gradient
+    steps, where a round has no batches), and begins anew in the next."""
     max_grad_norm: float = Field(1.0, gt=0)
     """A gradient that is longer is shortened to this."""
     asked_responses: int = Field(4, ge=2)
@@ -128,14 +129,18 @@ class Pairs:
 
     def minibatches(self, epochs: int, size: int, rng: np.random.Generator) -> list[Integers]:
         """Indices of pairs: each pair once an epoch, about equally many at a time."""
-        orders = [rng.permutation(len(self)) for _ in range(epochs)]
-        return [at for order in orders for at in np.array_split(order, -(-len(self) // size))]
+        return [at for _ in range(epochs) for at in shuffled(len(self), size, rng)]
 
     def gains(self, policy: LanguagePolicy, flat: Tensor) -> Tensor:
         """(b,) log-ratios of some responses to the starting policy, sums or means over tokens; differentiable."""
         rows = self.rows.rows(flat)
         gains = policy.log_prob(rows)[0].sum(1) - self.start[flat]
         return gains / rows.mask.sum(1) if self.length_normalised else gains
+
+
+def shuffled(count: int, size: int, rng: np.random.Generator) -> list[Integers]:
+    """All rows once, about equally many at a time."""
+    return np.array_split(rng.permutation(count), -(-count // size))
 
 
 def judged(store: Store[Response], kind: str) -> Batch[Response]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from prefrl.improve.direct import Direct, DirectSettings, means
+from prefrl.improve.direct import Direct, DirectSettings, means, shuffled
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.writer import Writer
 from prefrl.judgements import good
@@ -72,11 +72,6 @@ def best_responses(store: Store[Response]) -> list[Response]:
         told = good(one.judgement, len(one.query.candidates))
         found |= {c.id: c for c, is_good in zip(one.query.candidates, told, strict=True) if is_good}
     return list(found.values())
-
-
-def shuffled(count: int, size: int, rng: np.random.Generator) -> list[Integers]:
-    """All rows once, about equally many at a time."""
-    return np.array_split(rng.permutation(count), -(-count // size))
 
 
 def supervised(

@@ -1,8 +1,8 @@
 """Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE, PPO.
 
 Variant: one advantage a response; the KL of a response (k1, summed over its tokens) is taken off the reward before the
-baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the baseline too.
-GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction. PPO has one
+baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the baseline too. It
+may also come off the advantage of each token (OpenRLHF's REINFORCE family). GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction. PPO has one
 advantage a token, from a critic (Ziegler et al. 2019): the KL is taken off at each token, and the score comes with the
 last one.
 """
@@ -106,7 +106,8 @@ class TextLearnerSettings(Settings):
     learning_rate: float = Field(5e-4, gt=0)
     """Adam's."""
     schedule: Schedule = "constant"
-    """Of the learning rate: it stays, or in each round it falls to 0 along a line over the round's gradient steps."""
+    """Of the learning rate: it stays, or it falls towards 0 along a line over the batches of a round, and begins anew in
+    the next."""
     max_grad_norm: float = Field(1.0, gt=0)
     """A gradient that is longer is shortened to this."""
     temperature: float = Field(1.0, gt=0)
