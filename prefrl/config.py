@@ -22,6 +22,7 @@ from prefrl.protocols import (
     LabelerSettings,
     Learner,
     LearnerSettings,
+    Particular,
     RewardModel,
     RewardSettings,
     SelectorSettings,
@@ -114,6 +115,8 @@ class Config(Settings):
         task = self.build_task()
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
+        if isinstance(learner, Particular):
+            learner.check_reward(reward)
         if self.loop.labels and reward.fitted and not trainable(reward):
             raise ConfigError(f"loop.labels={self.loop.labels}, but this reward is not fitted: set loop.labels=0")
         return Loop(

@@ -429,6 +429,14 @@ class Learner(Protocol[C]):
     def load(self, state: State) -> None: ...
 
 
+@runtime_checkable
+class Particular(Protocol):
+    """A learner that not every reward model will do for."""
+
+    def check_reward(self, reward: RewardModel[Any]) -> None:
+        """Raises `ConfigError` where it will not do, before anybody is asked."""
+
+
 class Selector(Protocol[C]):
     """Which candidates are worth a label."""
 
@@ -458,6 +466,7 @@ __all__ = [
     "Learner",
     "Noted",
     "LearnerSettings",
+    "Particular",
     "Policy",
     "RewardModel",
     "RewardSettings",

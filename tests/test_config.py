@@ -105,6 +105,7 @@ def test_the_order_of_overrides_does_not_matter() -> None:
         (TOY, "reward.kind=linear fitting.crop=0.2", "fitting.crop: this reward is solved for"),
         (TOY, "fitting.ties=rao_kupper select.candidates=3", "knows pairs only, and select.candidates is 3"),
         ("text/toy", "fitting.crop=0.2", "only segments can be cropped"),
+        ("text/reviews-ppo", "learner.critic.network=reward reward.train=lora", "set reward.train=full"),
     ],
 )
 def test_what_a_fit_would_refuse_is_refused_before_anybody_is_asked(

@@ -19,8 +19,8 @@ def warnings(round: int, metrics: Mapping[str, float]) -> dict[str, str]:
     explained = metrics.get("improve/explained", 1.0)
     if round >= PATIENCE and explained < FORESEEN:
         found["critic"] = (
-            f"the critic explains {explained:.0%} of the returns' variance, after {round} rounds: it makes advantages "
-            "noisier than none would; raise the weight of its loss, or choose an algorithm without a critic"
+            f"after {round} rounds the critic explains {explained:.0%} of the returns' variance, which is hardly more "
+            "than a constant would: let it learn more from each batch, or choose an algorithm without a critic"
         )
     if metrics.get("improve/equal_groups", 0.0) == 1:
         found["reward"] = (

@@ -80,15 +80,23 @@ def by_token(
 def start_from_reward(policy: LanguagePolicy, reward: RewardModel[Response]) -> None:
     """Give the critic the reward model's network and head: at first its value is the score of what stands there.
 
-    Raises `ConfigError` where the reward model is no network like the policy's that reads the policy's tokens.
+    Raises `ConfigError` as `check_start` does.
+    """
+    found = check_start(policy, reward)
+    policy.start_critic(found.backbone.model.state_dict(), *found.mean_head())
+
+
+def check_start(policy: LanguagePolicy, reward: RewardModel[Response]) -> TransformerReward:
+    """The reward model, if a critic can start from it.
+
+    Raises `ConfigError` where it is no network like the policy's that reads the policy's tokens.
     """
     wanted = "learner.critic.network=reward starts from a reward model that is fitted whole on the starting policy"
     if not isinstance(reward, TransformerReward) or reward.backbone.opened is None or reward.backbone.chat:
         raise ConfigError(f"{wanted}: set reward.kind=transformer, and leave its backbone and checkpoint empty")
-    try:
-        policy.start_critic(reward.backbone.model.state_dict(), *reward.mean_head())
-    except RuntimeError as error:  # names or shapes differ
-        raise ConfigError(f"{wanted}: set reward.train=full, and leave reward.backbone empty") from error
+    if not policy.critic_fits(reward.backbone.model.state_dict()):
+        raise ConfigError(f"{wanted}: set reward.train=full, and leave reward.backbone empty")
+    return reward
 
 
 def _explained(errors: Tensor, returns: Tensor) -> float:

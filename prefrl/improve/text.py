@@ -1,10 +1,9 @@
 """Policy gradients for text, on the learned reward: RLOO, GRPO, REINFORCE, PPO.
 
 Variant: one advantage a response; the KL of a response (k1, summed over its tokens) is taken off the reward before the
-baseline, or off the advantage after it was normalised; the penalty for a missing end comes before the baseline too. It
-may also come off the advantage of each token (OpenRLHF's REINFORCE family). GRPO as published puts k3 of each token into the loss, whose gradient is that of the other direction. PPO has one
-advantage a token, from a critic (Ziegler et al. 2019): the KL is taken off at each token, and the score comes with the
-last one.
+baseline, or off the advantage after it was normalised, whole or token by token; the penalty for a missing end comes
+before the baseline too. GRPO as published puts k3 of each token into the loss, whose gradient is that of the other
+direction. PPO has one advantage a token, from a critic: see `prefrl.improve.ppo`.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from prefrl.improve.objectives import (
     step_rewards,
     win_rates,
 )
-from prefrl.improve.ppo import CriticSettings, by_token, critic_formula, start_from_reward
+from prefrl.improve.ppo import CriticSettings, by_token, check_start, critic_formula, start_from_reward
 from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
@@ -106,8 +105,8 @@ class TextLearnerSettings(Settings):
     learning_rate: float = Field(5e-4, gt=0)
     """Adam's."""
     schedule: Schedule = "constant"
-    """Of the learning rate: it stays, or it falls towards 0 along a line over the batches of a round, and begins anew in
-    the next."""
+    """Of the learning rate: it stays, or it falls towards 0 along a line over a round's batches, and begins anew in the
+    next."""
     max_grad_norm: float = Field(1.0, gt=0)
     """A gradient that is longer is shortened to this."""
     temperature: float = Field(1.0, gt=0)
@@ -235,6 +234,10 @@ class TextLearner:
                 break
         means = {name: _mean(values) for name, values in seen.items()}
         return means | {"ratio_error": max(seen["ratio_error"]), "updates": float(len(seen["ratio_error"]))}
+
+    def check_reward(self, reward: RewardModel[Response]) -> None:
+        if self._settings.critic.network == "reward":
+            check_start(self.policy, reward)
 
     def evaluate(self, reward: RewardModel[Response], rng: np.random.Generator) -> Evaluation[Response]:
         return self._writer.evaluate(self._settings.evaluation_prompts, reward, rng)

@@ -196,11 +196,14 @@ class LanguagePolicy:
         width = self.model.get_output_embeddings().weight.shape[1]  # type: ignore[no-untyped-call]
         self.critic = Critic(width, trunk, self._shortcuts)
 
-    def start_critic(self, trunk: State, weight: Tensor, bias: float) -> None:
-        """Let a critic with a network of its own go on from such weights, with a head (d,) and its bias.
+    def critic_fits(self, trunk: State) -> bool:
+        """Whether such weights have the names and the shapes of those of the critic's own network."""
+        own = self._critic().trunk
+        assert own is not None
+        return {n: p.shape for n, p in own.state_dict().items()} == {n: p.shape for n, p in trunk.items()}
 
-        Raises RuntimeError where names or shapes differ.
-        """
+    def start_critic(self, trunk: State, weight: Tensor, bias: float) -> None:
+        """Let a critic with a network of its own go on from such weights, with a head (d,) and its bias."""
         critic = self._critic()
         assert critic.trunk is not None
         critic.trunk.load_state_dict(trunk)

@@ -167,10 +167,11 @@ def test_a_critic_starts_from_the_reward_model_once(toy_reviews: Reviews) -> Non
 
 @pytest.mark.parametrize("reward", [{"train": "lora"}, None])
 def test_a_critic_cannot_start_from_any_reward(toy_reviews: Reviews, reward: dict[str, Any] | None) -> None:
-    one = learner(toy_reviews, "reward")
     found = LENGTHS if reward is None else fitted(toy_reviews, **reward)
     with pytest.raises(ConfigError, match=r"critic\.network=reward"):
-        one.improve(found, NO_STORE, np.random.default_rng(0))
+        learner(toy_reviews, "reward").check_reward(found)
+    learner(toy_reviews, "reward").check_reward(fitted(toy_reviews))
+    learner(toy_reviews, "own").check_reward(found)
 
 
 def test_what_no_reward_scored_leaves_policy_and_critic_as_they_are(toy_reviews: Reviews) -> None:
