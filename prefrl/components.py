@@ -58,6 +58,7 @@ class Settings(BaseModel):
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {
         "control": "prefrl.envs.control:ControlSettings",
+        "imdb": "prefrl.envs.imdb:IMDBSettings",
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
@@ -107,6 +108,7 @@ EXTRAS = {
     "datasets": "text",
     "peft": "text",
     "vaderSentiment": "text",
+    "sklearn": "imdb",
     "av": "label",
     "fastapi": "label",
     "starlette": "label",
