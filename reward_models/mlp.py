@@ -16,9 +16,9 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.components import Settings
+from prefrl.policies.perceptron import Activation, perceptrons
 from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.perceptron import Activation, perceptrons
 from prefrl.reward_models.steps import StepReward, uniform
 from prefrl.seeding import generator
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from prefrl.reward_models import perceptron
-from prefrl.reward_models.perceptron import perceptrons
+from prefrl.policies import perceptron
+from prefrl.policies.perceptron import perceptrons
 
 REFERENCES: dict[str, Any] = {"tanh": torch.tanh, "relu": torch.relu, "silu": torch.nn.functional.silu}
 EACH = pytest.mark.parametrize("activation", REFERENCES)
