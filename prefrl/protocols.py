@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Judged
@@ -391,6 +392,38 @@ class Policy(Protocol[I_contra]):
 
     def log_prob_and_values(self, inputs: I_contra) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]:
         """Both, in one pass where the critic shares the network."""
+
+
+class PassByHand(NamedTuple):
+    """A forward pass over B sequences of one step each, in NumPy, and the way back."""
+
+    logp: Floats | None
+    """(B, 1), as of `Policy.log_prob`."""
+    entropies: Floats | None
+    values: Floats | None
+    """(B, 1)."""
+    pull_back: Callable[[Floats | None, float, Floats | None], None]
+    """Make a loss's gradient that of the parameters, from what it is of the log-probabilities (B, 1), of each entropy
+    and of the values (B, 1)."""
+
+
+class Columns(Protocol):
+    """Sequences of one step each, all of them real."""
+
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """What the policy reads of them, (B, ...) each, in NumPy."""
+
+
+@runtime_checkable
+class ByHand(Policy[I_contra], Protocol[I_contra]):
+    """A policy whose gradient is worked out by hand, where it works by hand at all. It reads `Columns`."""
+
+    @property
+    def works_by_hand(self) -> bool:
+        """Whether it does so on the device where it is."""
+
+    def by_hand(self, inputs: Mapping[str, npt.NDArray[Any]], actor: bool, critic: bool) -> PassByHand:
+        """As `log_prob_and_values`, or one of the two alone, of some rows of the columns."""
 
 
 @runtime_checkable

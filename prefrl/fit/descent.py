@@ -163,7 +163,7 @@ class _Descent(Generic[C]):
         # What is learned beside the reward sees all scores on every rank: its gradient is whole already.
         world().sum_gradients(self.parameters)
         # The reward's alone: a tie or an error rate has few gradients, on another scale.
-        norm = _shorten([p.grad for p in self.parameters if p.grad is not None], self.fitting.max_grad_norm)
+        norm = world().clip_gradients(self.parameters, self.fitting.max_grad_norm)
         if not math.isfinite(norm):  # before the step, which would spread it over all weights
             raise FloatingPointError(
                 f"the gradient of the reward model's loss is {norm}, and the loss {float(loss.detach())}: "
@@ -183,17 +183,6 @@ class _Descent(Generic[C]):
 
     def _copies(self) -> list[Tensor]:
         return [p.detach().clone() for p in self._all()]
-
-
-def _shorten(gradients: list[Tensor], most: float) -> float:
-    """Scale gradients so that together they are no longer than `most`; returns how long they were.
-
-    torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
-    """
-    norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-    if norm > most:
-        torch._foreach_mul_(gradients, most / (norm + 1e-6))
-    return float(norm)
 
 
 def _alternate(problem: Problem[C]) -> None:

@@ -17,8 +17,8 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings, filled_in
-from prefrl.improve.gradient import Batch, Objective, adam, steer, update
-from prefrl.improve.objectives import gae, masked_whiten
+from prefrl.improve.gradient import Batch, adam, steer, update
+from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
 from prefrl.policies.mlp import Decisions, MLPPolicy
 from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
@@ -251,7 +251,8 @@ class ControlLearner:
 
     def _act(self, rng: np.random.Generator | None) -> Act:
         """The policy's choices, drawn from `rng`, or its mode."""
-        return lambda observations, legal: self.policy.act(observations, rng, legal)
+        actor = self.policy.numpy_actor()
+        return lambda observations, legal: actor(observations, rng, legal)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         """An array on the policy's device."""

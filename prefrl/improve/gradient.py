@@ -10,48 +10,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeAlias
+from typing import Any, Generic, TypeAlias, cast
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from prefrl.distributed import world
+from prefrl.improve import by_hand
 from prefrl.improve.objectives import (
-    Reduction,
+    Objective,
     clipped_surrogate,
-    kl_k3,
     log_ratio,
     masked_sum,
     policy_gradient,
     reduce,
     value_loss,
 )
-from prefrl.protocols import I, Policy
+from prefrl.protocols import ByHand, Columns, I, Policy
+from prefrl.seeding import to_numpy
 from prefrl.types import Integers, Metrics
 
 Parts: TypeAlias = Iterable[tuple[Tensor, dict[str, Tensor]]]
 """A loss in parts that add up, each with what it measured: (loss, name -> number)."""
-
-
-@dataclass(frozen=True)
-class Objective:
-    """What a gradient step minimises; a weight of 0 leaves its term out."""
-
-    clip: float | None = None
-    """How far the ratio of new to old probability counts; None for the plain policy gradient."""
-    policy: bool = True
-    """False: the critic alone learns."""
-    value: float = 0.0
-    """Weight of the critic's loss."""
-    value_clip: float | None = None
-    """How far a value may go from the batch's before its loss no longer falls; None for the plain loss."""
-    entropy: float = 0.0
-    """Weight of the entropy bonus."""
-    reduction: Reduction = "token"
-    """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
-    max_grad_norm: float = math.inf
-    """A gradient that is longer is shortened to this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +65,11 @@ class Batch(Generic[I]):
         advantages, logp = self.advantages[at, :width], self.logp[at, :width]  # (B, 1) stays (B, 1)
         return Batch(inputs, logp, advantages, cut(self.returns), cut(self.values))
 
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """In NumPy, of sequences of one step each: what the policy reads, and what the loss does."""
+        own = {"logp": self.logp, "advantages": self.advantages, "returns": self.returns}
+        return cast(Columns, self.inputs).columns() | {name: to_numpy(x) for name, x in own.items() if x is not None}
+
     def parts(self, size: int | None) -> Iterator[Batch[I]]:
         """This rank's sequences, at most `size` at a time, those together that are like each other; all at once for
         None."""
@@ -113,13 +100,30 @@ def update(
     `part`: at most so many sequences go through the network at once; that changes memory, and results by rounding only.
     Raises FloatingPointError where a loss or a gradient is not finite.
     """
+    if isinstance(policy, ByHand) and policy.works_by_hand and objective.value_clip is None:
+        return _update_by_hand(policy, optimizer, batch, minibatches, objective)
     return [step(policy, optimizer, batch.rows(rows), objective, part) for rows in minibatches]
+
+
+def _update_by_hand(
+    policy: ByHand[I],
+    optimizer: torch.optim.Optimizer,
+    batch: Batch[I],
+    minibatches: Iterable[Tensor],
+    objective: Objective,
+) -> list[Metrics]:
+    parameters, longest = list(policy.parameters()), objective.max_grad_norm
+    columns, found = batch.columns(), []
+    for rows in map(to_numpy, minibatches):
+        measured = by_hand.losses(policy, {k: x.take(rows, 0) for k, x in columns.items()}, objective)
+        found.append(_moved(parameters, optimizer, measured, longest))
+    return found
 
 
 def step(
     policy: Policy[I], optimizer: torch.optim.Optimizer, batch: Batch[I], objective: Objective, part: int | None
 ) -> Metrics:
-    """One gradient step.
+    """One gradient step, by automatic differentiation.
 
     Metrics, means over steps unless said: loss, grad_norm (before it is shortened), policy_loss (averaged as the
     objective says), value_loss and entropy where there are any, clipped (the share of ratios beyond the clip), kl_old
@@ -154,6 +158,13 @@ def descend(
         measured.append(torch.stack([loss.detach(), *seen.values()]))
     world().sum_gradients(parameters)
     metrics = _added(names, torch.stack(measured).tolist() if measured else [])
+    return _moved(parameters, optimizer, metrics, max_grad_norm)
+
+
+def _moved(
+    parameters: Iterable[torch.nn.Parameter], optimizer: torch.optim.Optimizer, metrics: Metrics, max_grad_norm: float
+) -> Metrics:
+    """Go down the gradient that the parameters have, and add how long it was to what was measured."""
     metrics["grad_norm"] = world().clip_gradients(parameters, max_grad_norm)
     for name in ("loss", "grad_norm"):
         if not math.isfinite(metrics[name]):
@@ -238,11 +249,12 @@ def _value(values: Tensor, batch: Batch[I], objective: Objective) -> Tensor:
 
 def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Tensor]:
     """How far the policy has gone from the one that drew the batch, from log-ratios that are 0 on padding."""
-    apart = ratios.expm1().abs()  # expm1 keeps the digits of ratios near 1
+    ahead = ratios.expm1()  # r - 1, with the digits of ratios near 1
+    apart = ahead.abs()
     return {
         "clipped": (apart > (objective.clip or math.inf)).sum() / steps,
-        # The old policy drew the samples, so this is KL(old || new): k3's d is log old - log new.
-        "kl_old": kl_k3(-ratios, ratios.new_zeros(())).sum() / steps,
+        # The old policy drew the samples, so this is KL(old || new), by k3 with d = log old - log new.
+        "kl_old": (ahead - ratios).sum() / steps,
         "ratio_error": apart.max(),
     }
 

@@ -19,6 +19,26 @@ MAX_LOG_RATIO = 20.0
 """Log-ratios are clamped to this before exp, so that one improbable token cannot make infinities."""
 
 
+@dataclass(frozen=True)
+class Objective:
+    """What a gradient step minimises; a weight of 0 leaves its term out."""
+
+    clip: float | None = None
+    """How far the ratio of new to old probability counts; None for the plain policy gradient."""
+    policy: bool = True
+    """False: the critic alone learns."""
+    value: float = 0.0
+    """Weight of the critic's loss."""
+    value_clip: float | None = None
+    """How far a value may go from the batch's before its loss no longer falls; None for the plain loss."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    reduction: Reduction = "token"
+    """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
+    max_grad_norm: float = math.inf
+    """A gradient that is longer is shortened to this."""
+
+
 # --- Masked statistics ------------------------------------------------------------------------------------------
 
 

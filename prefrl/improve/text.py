@@ -21,9 +21,10 @@ from torch import Tensor
 
 from prefrl.components import Settings, filled_in
 from prefrl.evaluate.policies import scored
-from prefrl.improve.gradient import Batch, Objective, update
+from prefrl.improve.gradient import Batch, update
 from prefrl.improve.objectives import (
     AdaptiveKL,
+    Objective,
     Reduction,
     all_equal,
     batch_centred,

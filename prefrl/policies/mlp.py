@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from prefrl.protocols import ControlTask
+from prefrl.policies.heads import ILLEGAL, Categorical, Gaussian
+from prefrl.policies.perceptron import Layers, backward, forward
+from prefrl.protocols import ControlTask, PassByHand
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, State
 
 CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations."""
-ILLEGAL = -1e9
-"""The logit of an action that is not legal (Huang and Ontanon 2022, section 3): its probability is 0, and 0 times its
-logarithm is 0 as well, where minus infinity would make NaN of it."""
 
 
 @dataclass(frozen=True)
@@ -77,49 +79,98 @@ class Decisions:
     def order(self) -> Tensor:
         return torch.arange(len(self.choices), device=self.choices.device)
 
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """The same in NumPy."""
+        found = {"observations": to_numpy(self.observations), "choices": to_numpy(self.choices)}
+        return found if self.legal is None else found | {"legal": to_numpy(self.legal)}
+
+
+@dataclass(frozen=True, eq=False)
+class NumpyActor:
+    """Acts as a policy did when this was made."""
+
+    space: ActionSpace
+    layers: Layers
+    std: Floats | None
+    """(A,) of the noise; None where actions are discrete."""
+    mean: Floats
+    scale: Floats
+    """(O,) of the normaliser: what is taken off, and what the rest is multiplied by."""
+
+    def normalise(self, observations: Floats) -> Floats:
+        """(..., O) -> (..., O) float32."""
+        scaled = (observations - self.mean) * self.scale
+        # A state far outside of what was seen would otherwise saturate the first layer.
+        return np.minimum(np.maximum(scaled, -CLIP, out=scaled), CLIP, out=scaled)  # np.clip, in half its time
+
+    def __call__(
+        self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
+    ) -> tuple[Floats, Floats]:
+        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None.
+
+        `legal` (n, A): which discrete actions there are; the others are not chosen.
+        """
+        outputs, _ = forward(self.normalise(observations), self.layers, "tanh")
+        if self.std is None:
+            outputs = outputs if legal is None else np.where(legal, outputs, -np.inf)
+            # The largest of logits plus Gumbel noise is a draw from their softmax.
+            noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
+            choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
+            return choices, choices
+        if rng is not None:
+            outputs += self.std * rng.standard_normal(outputs.shape, np.float32)
+        return outputs, self.space.execute(outputs)
+
+
+class Views(NamedTuple):
+    """Weights, or their gradients, as NumPy's views into one tensor."""
+
+    actor: Layers
+    critic: Layers
+    log_std: Floats | None
+    """(A,)."""
+
 
 class MLPPolicy:
     """A `prefrl.protocols.Policy` of `Decisions`: an actor and a critic, each an MLP with tanh.
 
     For boxes the log standard deviation is a parameter of its own, the same in every state.
 
-    Weights are orthogonal with gains sqrt(2), 0.01 for the actor's last layer and 1 for the critic's. Acting is
-    NumPy on the same weights: for networks this small torch's overhead would be most of the time.
+    Weights are orthogonal with gains sqrt(2), 0.01 for the actor's last layer and 1 for the critic's. All of them lie
+    in one tensor: an optimiser's step and a gradient's norm are then one call each. Acting is NumPy, and on the CPU so
+    is the gradient (`by_hand`): for networks this small torch's overhead would be most of the time.
     """
 
     def __init__(self, task: ControlTask, hidden: tuple[int, ...], initial_std: float, rng: np.random.Generator):
         self.space = ActionSpace.of(task)
         size, order = task.observation_size, generator(rng)
-        self.actor = _mlp((size, *hidden, task.action_size), 0.01, order)
-        self.critic = _mlp((size, *hidden, 1), 1.0, order)
-        self.log_std = torch.nn.Parameter(torch.full((task.action_size,), math.log(initial_std)))
+        nets = {"actor": _mlp((size, *hidden, task.action_size), 0.01, order)}
+        nets["critic"] = _mlp((size, *hidden, 1), 1.0, order)
+        named = {f"{net}_{i}": p for net, parameters in nets.items() for i, p in enumerate(parameters)}
+        if not self.space.discrete:
+            named["log_std"] = torch.full((task.action_size,), math.log(initial_std))
+        self._shapes = {name: p.shape for name, p in named.items()}
+        self._flat = torch.nn.Parameter(torch.cat([p.flatten() for p in named.values()]))
+        self.to(self.device)
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
 
     @property
     def device(self) -> torch.device:
-        return self.log_std.device
+        return self._flat.device
 
     def to(self, device: torch.device) -> None:
         """Move the weights to a device; acting and the normaliser stay NumPy."""
-        for _, parameter in self._named():
-            parameter.data = parameter.data.to(device)
+        self._flat.data = self._flat.data.to(device)
+        self._gradient = torch.zeros_like(self._flat.data)
+        # Views once and for all: the optimiser's steps change what they show.
+        self._weights, self._slopes = self._views(self._flat.data), self._views(self._gradient)
 
     def parameters(self) -> list[torch.nn.Parameter]:
-        return [*self.actor, *([] if self.space.discrete else [self.log_std]), *self.critic]
+        return [self._flat]
 
     def normalise(self, observations: Floats) -> Floats:
         """(..., O) -> (..., O) float32, by the statistics so far."""
-        scaled = (observations - self._mean32) * self._scale32
-        # A state far outside of what was seen would otherwise saturate the first layer.
-        return np.clip(scaled, -CLIP, CLIP, out=scaled)
-
-    @property
-    def _mean32(self) -> Floats:
-        return self.mean.astype(np.float32)
-
-    @property
-    def _scale32(self) -> Floats:
-        return (1.0 / np.sqrt(self.variance + 1e-8)).astype(np.float32)  # eps: some inputs never change
+        return self.numpy_actor().normalise(observations)
 
     def observe(self, observations: Floats) -> None:
         """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979).
@@ -134,92 +185,120 @@ class MLPPolicy:
         self.mean = self.mean + delta * len(new) / total
         self.variance, self.count = squares / total, total
 
-    def act(
-        self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
-    ) -> tuple[Floats, Floats]:
-        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None.
-
-        `legal` (n, A): which discrete actions there are; the others are not chosen.
-        """
-        outputs = self._actor_numpy(self.normalise(observations))
-        if self.space.discrete:
-            outputs = outputs if legal is None else np.where(legal, outputs, -np.inf)
-            # The largest of logits plus Gumbel noise is a draw from their softmax.
-            noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
-            choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
-            return choices, choices
-        if rng is not None:
-            std = np.exp(to_numpy(self.log_std))
-            outputs = outputs + std * rng.standard_normal(outputs.shape, np.float32)
-        return outputs, self.space.execute(outputs)
+    def numpy_actor(self) -> NumpyActor:
+        """What acts as the policy does now; it is not to be kept while the policy learns."""
+        weights = self._views(self._flat)
+        std = None if weights.log_std is None else np.exp(weights.log_std)
+        scale = 1.0 / np.sqrt(self.variance + 1e-8)  # eps: some inputs never change
+        return NumpyActor(self.space, weights.actor, std, self.mean.astype(np.float32), scale.astype(np.float32))
 
     def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
-        outputs = forward(self.actor, inputs.observations)
+        outputs = self._outputs("actor", inputs.observations)
         if self.space.discrete:
             outputs = outputs if inputs.legal is None else outputs.masked_fill(~inputs.legal, ILLEGAL)
-            logp = (outputs.log_softmax(-1) * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
-            return logp, categorical_entropy(outputs)[:, None]
-        scaled = (inputs.choices - outputs) * (-self.log_std).exp()
-        constant = self.log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
+            every = outputs.log_softmax(-1)
+            logp = (every * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
+            return logp, -(every.exp() * every).sum(-1, keepdim=True)
+        log_std = self.named()["log_std"]
+        scaled = (inputs.choices - outputs) * (-log_std).exp()
+        constant = log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
         entropy = constant + 0.5 * self.space.size
         # A Gaussian's entropy hangs on its std alone, which is the same in every state.
         return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(len(outputs), 1)
 
     def values(self, inputs: Decisions) -> Tensor:
         """(B, 1)."""
-        return forward(self.critic, inputs.observations)
+        return self._outputs("critic", inputs.observations)
 
     def log_prob_and_values(self, inputs: Decisions) -> tuple[Tensor, Tensor, Tensor]:
         return *self.log_prob(inputs), self.values(inputs)
 
     def values_of(self, observations: Tensor) -> Tensor:
         """Normalised observations (..., O) -> (...)."""
-        return forward(self.critic, observations).squeeze(-1)
+        return self._outputs("critic", observations).squeeze(-1)
+
+    @property
+    def works_by_hand(self) -> bool:
+        return self._flat.is_cpu
+
+    def by_hand(self, inputs: Mapping[str, npt.NDArray[Any]], actor: bool, critic: bool) -> PassByHand:
+        observations, traces = inputs["observations"], []
+        weights, head, values = self._weights, None, None
+        if actor:
+            outputs, trace = forward(observations, weights.actor, "tanh")
+            head = self._head(outputs, inputs)
+            traces.append(trace)
+        if critic:
+            values, trace = forward(observations, weights.critic, "tanh")
+            traces.append(trace)
+
+        def pull_back(of_logp: Floats | None, of_entropy: float, of_values: Floats | None) -> None:
+            self._flat.grad, slopes = self._gradient.zero_(), self._slopes
+            if head is not None and of_logp is not None:
+                of_outputs, of_std = head.slopes(of_logp, of_entropy)
+                backward(of_outputs, weights.actor, traces[0], "tanh", slopes.actor)
+                if slopes.log_std is not None:
+                    slopes.log_std[:] = of_std
+            if of_values is not None:
+                backward(of_values, weights.critic, traces[-1], "tanh", slopes.critic)
+
+        logp, entropies = head.log_prob() if head else (None, None)
+        return PassByHand(logp, entropies, values, pull_back)
 
     def state(self) -> State:
-        named = {name: p.detach().clone() for name, p in self._named()}
+        named = {name: p.detach().clone() for name, p in self.named().items()}
         return {"parameters": named, "mean": self.mean, "variance": self.variance, "count": self.count}
 
+    @torch.no_grad()
     def load(self, state: State) -> None:
         """Raises ValueError where shapes differ."""
-        for name, parameter in self._named():
+        for name, parameter in self.named().items():
             if state["parameters"][name].shape != parameter.shape:
                 found, expected = tuple(state["parameters"][name].shape), tuple(parameter.shape)
                 raise ValueError(f"policy: {name} has shape {found}, expected {expected}: other settings or task")
-            parameter.data.copy_(state["parameters"][name])  # in place: the optimiser holds these very tensors
+            parameter.copy_(state["parameters"][name])  # in place: the optimiser holds this very memory
         self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
 
-    def _named(self) -> list[tuple[str, torch.nn.Parameter]]:
-        nets = [(f"actor_{i}", p) for i, p in enumerate(self.actor)]
-        return nets + [(f"critic_{i}", p) for i, p in enumerate(self.critic)] + [("log_std", self.log_std)]
+    def named(self) -> dict[str, Tensor]:
+        """Every weight by its name, as torch lays layers out, (out, in) and (out,): views of what learns."""
+        return {name: part.T if part.dim() == 2 else part for name, part in self._parts(self._flat).items()}
 
-    def _actor_numpy(self, x: Floats) -> Floats:
-        arrays = [to_numpy(p) for p in self.actor]  # views, which follow the optimiser's steps
-        for i in range(0, len(arrays) - 2, 2):
-            x = np.tanh(x @ arrays[i].T + arrays[i + 1])
-        out: Floats = x @ arrays[-2].T + arrays[-1]
-        return out
+    def _parts(self, flat: Tensor) -> dict[str, Tensor]:
+        """(in, out) and (out,) of each layer: for products of rows, weights lie in memory like that."""
+        parts = flat.split([shape.numel() for shape in self._shapes.values()])  # type: ignore[no-untyped-call]
+        return {name: part.view(shape) for (name, shape), part in zip(self._shapes.items(), parts, strict=True)}
+
+    def _views(self, flat: Tensor) -> Views:
+        arrays = {name: to_numpy(part) for name, part in self._parts(flat).items()}
+        nets = [[arrays[name] for name in self._names(net)] for net in ("actor", "critic")]
+        actor, critic = ([(w, b[None]) for w, b in zip(net[::2], net[1::2], strict=True)] for net in nets)
+        return Views(actor, critic, arrays.get("log_std"))
+
+    def _head(self, outputs: Floats, inputs: Mapping[str, Any]) -> Gaussian | Categorical:
+        log_std = self._weights.log_std
+        if log_std is None:
+            return Categorical(outputs, inputs["choices"], inputs.get("legal"))
+        return Gaussian(outputs, inputs["choices"], log_std)
+
+    def _names(self, net: str) -> list[str]:
+        return [name for name in self._shapes if name.startswith(net)]
+
+    def _outputs(self, net: str, x: Tensor) -> Tensor:
+        """(..., O) -> (..., out) of the actor or the critic."""
+        parameters = self.named()
+        *hidden, last_weight, last_bias = (parameters[name] for name in self._names(net))
+        for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
+            x = torch.tanh(torch.nn.functional.linear(x, weight, bias))
+        return torch.nn.functional.linear(x, last_weight, last_bias)
 
 
-def categorical_entropy(logits: Tensor) -> Tensor:
-    """(..., V) -> (...): entropy in nats."""
-    logp = logits.log_softmax(-1)
-    return -(logp.exp() * logp).sum(-1)
-
-
-def forward(net: list[torch.nn.Parameter], x: Tensor) -> Tensor:
-    """An MLP given as [weight, bias, weight, bias, ...], tanh between layers."""
-    for i in range(0, len(net) - 2, 2):
-        x = torch.tanh(torch.nn.functional.linear(x, net[i], net[i + 1]))
-    return torch.nn.functional.linear(x, net[-2], net[-1])
-
-
-def _mlp(sizes: tuple[int, ...], last_gain: float, order: torch.Generator) -> list[torch.nn.Parameter]:
+def _mlp(sizes: tuple[int, ...], last_gain: float, order: torch.Generator) -> list[Tensor]:
+    """Weight (in, out) and bias (out,) of each layer."""
     net = []
     for i, (fan_in, fan_out) in enumerate(pairwise(sizes)):
         # 0.01 for the actor: it starts with about the same distribution in every state.
         gain = last_gain if i == len(sizes) - 2 else math.sqrt(2)
         weight = torch.nn.init.orthogonal_(torch.empty(fan_out, fan_in), gain, order)
-        net += [torch.nn.Parameter(weight), torch.nn.Parameter(torch.zeros(fan_out))]
+        net += [weight.T, torch.zeros(fan_out)]
     return net

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from prefrl.improve.gradient import Batch, Objective, adam, steer, step, update
-from prefrl.improve.objectives import Reduction
+from prefrl.improve.gradient import Batch, adam, steer, step, update
+from prefrl.improve.objectives import Objective, Reduction
 
 V, L = 4, 3
 

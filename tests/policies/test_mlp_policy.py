@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 from corridor import corridor
 
 from prefrl.envs.control import ControlSettings
-from prefrl.policies.mlp import ActionSpace, Decisions, MLPPolicy, categorical_entropy, forward
+from prefrl.policies.mlp import ActionSpace, Decisions, MLPPolicy
 
 
 def _policy(env: str, seed: int = 0) -> MLPPolicy:
@@ -19,19 +17,24 @@ def _policy(env: str, seed: int = 0) -> MLPPolicy:
     return policy
 
 
+def _lean(policy: MLPPolicy, bias: list[float]) -> None:
+    """Towards some actions."""
+    with torch.no_grad():
+        policy.named()["actor_" + str(len(policy._names("actor")) - 1)].copy_(torch.tensor(bias))
+
+
 @pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
 def test_numpy_acts_as_torch_would(env: str) -> None:
     policy = _policy(env)
-    for p in policy.actor:
-        p.data += 0.1 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    (weights,) = policy.parameters()
+    weights.data += 0.1 * torch.randn(weights.shape, generator=torch.Generator().manual_seed(0))
     observations = np.random.default_rng(3).normal(size=(9, len(policy.mean))).astype(np.float32)
-    inputs = torch.from_numpy(policy.normalise(observations))
-    ours, theirs = policy._actor_numpy(policy.normalise(observations)), forward(policy.actor, inputs)
-    np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-6)
-    choices, actions = policy.act(observations, None)
+    theirs = policy._outputs("actor", torch.from_numpy(policy.normalise(observations)))
+    choices, actions = policy.numpy_actor()(observations, None)
     if env == "CartPole-v1":
         assert np.array_equal(choices.argmax(1), theirs.argmax(1).numpy())
     else:
+        np.testing.assert_allclose(choices, theirs.detach().numpy(), atol=1e-6)
         np.testing.assert_allclose(actions, np.clip(theirs.detach().numpy(), -1, 1) * 2, atol=1e-6)
 
 
@@ -39,16 +42,16 @@ def test_densities_and_entropies_are_those_of_torch_distributions() -> None:
     policy = _policy("Pendulum-v1")
     inputs, choices = torch.randn(7, 3), torch.randn(7, 1)
     logp, entropy = policy.log_prob(Decisions(inputs, choices))
-    normal = torch.distributions.Normal(forward(policy.actor, inputs), policy.log_std.exp())
+    normal = torch.distributions.Normal(policy._outputs("actor", inputs), policy.named()["log_std"].exp())
     torch.testing.assert_close(logp, normal.log_prob(choices))  # type: ignore[no-untyped-call]
     torch.testing.assert_close(entropy, normal.entropy())  # type: ignore[no-untyped-call]
 
 
 def test_categorical_choices_follow_their_probabilities() -> None:
     policy = _policy("CartPole-v1")
-    policy.actor[-1].data = torch.tensor([0.0, 1.5])
+    _lean(policy, [0.0, 1.5])
     observations = np.tile(np.array([0.1, 0.2, 0.0, -0.1], np.float32), (20_000, 1))
-    choices, actions = policy.act(observations, np.random.default_rng(0))
+    choices, actions = policy.numpy_actor()(observations, np.random.default_rng(0))
     logp, entropy = policy.log_prob(Decisions(torch.from_numpy(policy.normalise(observations[:2])), torch.eye(2)))
     assert choices is actions
     assert choices.mean(0)[0] == pytest.approx(float(logp.detach()[0].exp()), abs=0.01)
@@ -57,7 +60,7 @@ def test_categorical_choices_follow_their_probabilities() -> None:
 
 def test_gaussian_noise_has_the_stated_deviation_and_actions_keep_to_their_bounds() -> None:
     policy = _policy("Pendulum-v1")
-    choices, actions = policy.act(np.zeros((20_000, 3), np.float32), np.random.default_rng(0))
+    choices, actions = policy.numpy_actor()(np.zeros((20_000, 3), np.float32), np.random.default_rng(0))
     assert choices.std() == pytest.approx(0.7, abs=0.02)
     assert (actions.min(), actions.max()) == (-2.0, 2.0)
 
@@ -82,15 +85,11 @@ def test_unbounded_actions_are_left_alone() -> None:
 def test_state_and_load_give_the_same_policy() -> None:
     policy, other = _policy("Pendulum-v1"), _policy("Pendulum-v1", seed=1)
     observations = np.random.default_rng(3).normal(size=(4, 3)).astype(np.float32)
-    assert other.act(observations, None)[0].tobytes() != policy.act(observations, None)[0].tobytes()
+    assert other.numpy_actor()(observations, None)[0].tobytes() != policy.numpy_actor()(observations, None)[0].tobytes()
     other.load(policy.state())
-    assert other.act(observations, None)[0].tobytes() == policy.act(observations, None)[0].tobytes()
+    assert other.numpy_actor()(observations, None)[0].tobytes() == policy.numpy_actor()(observations, None)[0].tobytes()
     with pytest.raises(ValueError, match="actor_0 has shape"):
         other.load(_policy("CartPole-v1").state())
-
-
-def test_entropy_of_even_odds_is_the_logarithm_of_the_choices() -> None:
-    torch.testing.assert_close(categorical_entropy(torch.zeros(2, 5)), torch.full((2,), math.log(5)))
 
 
 LEGAL = np.array([[True, False, True], [True, True, True], [False, True, False]])
@@ -98,10 +97,10 @@ LEGAL = np.array([[True, False, True], [True, True, True], [False, True, False]]
 
 def test_actions_that_are_not_legal_are_never_chosen() -> None:
     policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
-    policy.actor[-1].data = torch.tensor([0.0, 3.0, 0.5])
+    _lean(policy, [0.0, 3.0, 0.5])
     observations, legal = np.zeros((3_000, 1), np.float32), np.tile(LEGAL, (1_000, 1))
-    drawn, _ = policy.act(observations, np.random.default_rng(1), legal)
-    mode, _ = policy.act(observations[:3], None, LEGAL)
+    drawn, _ = policy.numpy_actor()(observations, np.random.default_rng(1), legal)
+    mode, _ = policy.numpy_actor()(observations[:3], None, LEGAL)
     assert not drawn[~legal].any()
     assert mode.argmax(1).tolist() == [2, 1, 1]
     expected = policy.log_prob(_three(np.eye(3, dtype=np.float32)[[2, 2, 2]]))[0].exp().detach()[:, 0]
@@ -111,19 +110,19 @@ def test_actions_that_are_not_legal_are_never_chosen() -> None:
 
 def test_the_densities_of_legal_actions_are_those_of_a_choice_among_them_alone() -> None:
     policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
-    policy.actor[-1].data = torch.tensor([0.0, 3.0, 0.5])
+    _lean(policy, [0.0, 3.0, 0.5])
     choices = np.eye(3, dtype=np.float32)[[2, 0, 1]]
     logp, entropy = policy.log_prob(_three(choices))
-    outputs = forward(policy.actor, torch.zeros(3, 1)).detach()
+    outputs = policy._outputs("actor", torch.zeros(3, 1)).detach()
     for i in range(3):
         alone = torch.distributions.Categorical(logits=outputs[i][torch.from_numpy(LEGAL[i])])
         place = int(LEGAL[i][: int(choices[i].argmax())].sum())
         assert float(logp[i].detach()) == pytest.approx(float(alone.log_prob(torch.tensor(place))), abs=1e-6)  # type: ignore[no-untyped-call]
         assert float(entropy[i].detach()) == pytest.approx(float(alone.entropy()), abs=1e-6)  # type: ignore[no-untyped-call]
     (logp.sum() + entropy.sum()).backward()  # type: ignore[no-untyped-call]
-    gradient = policy.actor[-1].grad
-    assert gradient is not None
-    assert gradient.isfinite().all()
+    (weights,) = policy.parameters()
+    assert weights.grad is not None
+    assert weights.grad.isfinite().all()
 
 
 def test_where_all_actions_are_legal_it_is_as_if_nobody_had_asked() -> None:
@@ -134,7 +133,9 @@ def test_where_all_actions_are_legal_it_is_as_if_nobody_had_asked() -> None:
     for one, other in zip(policy.log_prob(free), policy.log_prob(told.rows(torch.arange(3))), strict=True):
         assert torch.equal(one, other)
     observations = np.ones((3, 1), np.float32)
-    with_mask, without = (policy.act(observations, np.random.default_rng(0), legal)[0] for legal in (every, None))
+    with_mask, without = (
+        policy.numpy_actor()(observations, np.random.default_rng(0), legal)[0] for legal in (every, None)
+    )
     np.testing.assert_array_equal(with_mask, without)
 
 
