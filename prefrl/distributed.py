@@ -8,6 +8,7 @@ number of ranks but by rounding. A process by itself is a world of one, where al
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,10 +17,13 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import TypeVar, cast
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor
 from torch._C._distributed_c10d import Store
+
+from prefrl.seeding import to_numpy
 
 T = TypeVar("T")
 
@@ -221,8 +225,13 @@ def _shorten(gradients: list[Tensor], most: float) -> float:
 
     torch's clip_grad_norm_ does the same, and for a small network takes as long as a layer.
     """
-    norms = torch.stack(torch._foreach_norm(gradients)) if len(gradients) != 1 else gradients[0]
-    norm = float(torch.linalg.vector_norm(norms))
+    if len(gradients) == 1 and gradients[0].is_cpu:
+        found = to_numpy(gradients[0])
+        norm = math.sqrt(np.vdot(found, found))
+        if norm > most:
+            found *= most / (norm + 1e-6)
+        return norm
+    norm = float(torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients))))
     if norm > most:
         torch._foreach_mul_(gradients, most / (norm + 1e-6))
     return norm

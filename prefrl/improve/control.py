@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import Settings, filled_in
-from prefrl.improve.gradient import Batch, adam, steer, update
+from prefrl.improve.gradient import Batch, adam_of, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
 from prefrl.policies.mlp import Decisions, MLPPolicy
@@ -140,7 +140,7 @@ class ControlLearner:
         self._player = Player(task, settings.environments)
         self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
         self.policy.to(device_of(settings.device))
-        self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
+        self._optimizer = adam_of(self.policy, settings.learning_rate)
 
     @property
     def steps(self) -> Steps:

@@ -234,7 +234,9 @@ class MLPPolicy:
             traces.append(trace)
 
         def pull_back(of_logp: Floats | None, of_entropy: float, of_values: Floats | None) -> None:
-            self._flat.grad, slopes = self._gradient.zero_(), self._slopes
+            self._flat.grad, slopes = self._gradient, self._slopes
+            if not (actor and critic):
+                self._gradient.zero_()
             if head is not None and of_logp is not None:
                 of_outputs, of_std = head.slopes(of_logp, of_entropy)
                 backward(of_outputs, weights.actor, traces[0], "tanh", slopes.actor)
