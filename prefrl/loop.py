@@ -16,7 +16,7 @@ from pydantic import Field
 from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
-from prefrl.protocols import Labeler, Learner, RewardModel, Selector, Store, Task
+from prefrl.protocols import Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
 from prefrl.seeding import Streams, streams
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
@@ -96,6 +96,8 @@ class Loop(Generic[C]):
         fitted = self._fit(rng, pool)
         improved: Metrics = {}
         if self.reward.fitted:
+            if isinstance(self.learner, Paced):
+                self.learner.pace((number - 1) / self.settings.rounds, number / self.settings.rounds)
             with self._timed("improve"):
                 improved = self.learner.improve(self.reward, self.store, rng.improve)
         return self._finish(number, improved, self._evaluate(rng), fitted)
@@ -153,7 +155,9 @@ class Loop(Generic[C]):
 
     def _evaluate(self, rng: Streams) -> Evaluation[C]:
         with self._timed("evaluate"):
-            return self.learner.evaluate(self.reward, rng.evaluate)
+            evaluated = self.learner.evaluate(self.reward, rng.evaluate)
+            settled = self.learner.settle(self.reward) if isinstance(self.learner, Settles) else None
+        return settled or evaluated
 
     def _finish(self, number: int, improved: Metrics, evaluated: Evaluation[C], fitted: Fitted | None) -> Round[C]:
         """Gather the round's numbers, and count it as done."""
@@ -168,7 +172,7 @@ class Loop(Generic[C]):
         if not self.reward.fitted:
             stages["evaluate"].pop("learned", None)  # what an unfitted network says means nothing
         metrics = {f"{stage}/{name}": value for stage, values in stages.items() for name, value in values.items()}
-        notes = (*self._notes, *self._warnings(number, metrics))
+        notes = (*self._notes, *evaluated.notes, *self._warnings(number, metrics))
         self.sequence = self.store.sequence
         self.round, self._seconds, self._notes, self.stage = number, {}, [], "idle"
         return Round(number, metrics, evaluated.examples, fitted, notes)

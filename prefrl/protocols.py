@@ -441,6 +441,22 @@ class LearnerSettings(Protocol):
     def build(self, task: Any, rng: np.random.Generator) -> Learner: ...
 
 
+@runtime_checkable
+class Settles(Protocol[C]):
+    """A learner that goes back to its best policy where a round lost too much."""
+
+    def settle(self, reward: RewardModel[C]) -> Evaluation[C] | None:
+        """After an evaluation: None, or how the policy does that stands again."""
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A learner whose learning rate falls over the run."""
+
+    def pace(self, begin: float, end: float) -> None:
+        """Before a round: which shares of the run are over at its beginning and at its end."""
+
+
 class Learner(Protocol[C]):
     """A policy that samples candidates, and gets better at good ones."""
 

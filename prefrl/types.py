@@ -164,6 +164,8 @@ class Evaluation(Generic[C]):
 
     metrics: Metrics
     examples: tuple[C, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What a person should know."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -29,10 +29,7 @@ ORDERS = 4
 
 def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
     """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`; and openings to look at."""
-    lengths = rollout.ends.argmax(1) + 1  # (n,): argmax is the first end; what comes after it does not count
-    mask = np.arange(rollout.ends.shape[1]) < lengths[:, None]
-    gold = np.where(mask, rollout.gold, 0.0).sum(1)
-    learned = np.where(mask, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)
+    gold, learned, lengths = returns(rollout, reward)
     shown = max(1, round(EXAMPLE_SECONDS * task.fps))
     examples = [
         segment(rollout, i, 0, min(int(lengths[i]), shown), "evaluation") for i in range(min(EXAMPLES, len(gold)))
@@ -44,6 +41,24 @@ def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]
         "length": float(lengths.mean()),
     }
     return Evaluation(metrics, tuple(examples))
+
+
+class Returns(NamedTuple):
+    """(n,) of the first episode of each row."""
+
+    gold: Floats
+    learned: Floats
+    lengths: Integers
+    """Steps."""
+
+
+def returns(rollout: Rollout, reward: RewardModel[Segment]) -> Returns:
+    """What the first episodes are worth."""
+    lengths = rollout.ends.argmax(1) + 1  # argmax is the first end; what comes after it does not count
+    mask = np.arange(rollout.ends.shape[1]) < lengths[:, None]
+    learned = learned_rewards(step_rewards(reward), rollout)
+    gold, learned = (np.where(mask, values, 0.0).sum(1) for values in (rollout.gold, learned))
+    return Returns(gold, learned, lengths)
 
 
 def responses(

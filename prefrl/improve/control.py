@@ -8,6 +8,9 @@ clipped; actor and critic share nothing but the observation normaliser.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -69,6 +72,11 @@ class ControlLearnerSettings(Settings):
     """Extra passes for the critic alone at the start of a round, when the reward is new to it."""
     max_grad_norm: float = Field(0.5, gt=0)
     """A gradient that is longer is shortened to this."""
+    schedule: Literal["constant", "linear"] = "linear"
+    """Over the run the learning rate stays as it is, or falls to 0."""
+    rollback: float | None = Field(0.25, ge=0)
+    """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
+    one; null keeps whatever comes."""
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers, of the policy and of the critic."""
     initial_std: float = Field(1.0, gt=0)
@@ -141,6 +149,7 @@ class ControlLearner:
         self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
         self.policy.to(device_of(settings.device))
         self._optimizer = adam_of(self.policy, settings.learning_rate)
+        self._span = 0.0, 0.0
 
     @property
     def steps(self) -> Steps:
@@ -159,10 +168,11 @@ class ControlLearner:
         scorer, count = step_rewards(reward), self._settings.environments
         envs, rollouts, metrics = self._task.environments(count), [], []
         observations = envs.reset(rng)
-        for number, steps in enumerate(self._rollout_lengths()):
+        lengths = self._rollout_lengths()
+        for number, steps in enumerate(lengths):
             rollout, observations = collect(envs, observations, steps, self._act(rng))
             # Only before the first rollout is the reward one that the critic has not seen.
-            metrics.append(self._learn(rollout, scorer, rng, critic_first=number == 0))
+            metrics.append(self._learn(rollout, scorer, rng, number == 0, self._left(number / len(lengths))))
             rollouts.append(rollout)
         # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._player.learned_from(joined(rollouts))
@@ -171,6 +181,21 @@ class ControlLearner:
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
         return self._player.evaluate(self._settings.evaluation_episodes, self._act(None), reward, rng)
+
+    def settle(self, reward: RewardModel[Segment]) -> Evaluation[Segment] | None:
+        """Go back to the best policy, by the newest reward, where the last round lost clearly (`Best.settle`)."""
+        if self._settings.rollback is None:
+            return None
+        weights = {"policy": self.policy.state(), "optimizer": deepcopy(self._optimizer.state_dict())}
+        settled = self._player.settle(weights, reward, self._settings.rollback)
+        if settled is None:
+            return None
+        self.policy.load(settled.weights["policy"])
+        self._optimizer.load_state_dict(settled.weights["optimizer"])
+        return settled.evaluation
+
+    def pace(self, begin: float, end: float) -> None:
+        self._span = begin, end
 
     def state(self) -> State:
         return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()} | self._player.state()
@@ -186,30 +211,47 @@ class ControlLearner:
         parts = max(1, round(each / self._settings.rollout_steps))
         return [len(part) for part in np.array_split(np.arange(each), parts)]
 
+    def _left(self, done: float) -> float:
+        """What is left of the learning rate when that share of the round is done."""
+        begin, end = self._span
+        return 1 - (begin + (end - begin) * done) if self._settings.schedule == "linear" else 1.0
+
+    @contextmanager
+    def _slowed(self, left: float) -> Iterator[None]:
+        (group,) = self._optimizer.param_groups
+        steered = group["lr"]
+        group["lr"] = steered * left
+        yield
+        group["lr"] = steered
+
     def _learn(
-        self, rollout: Rollout, reward: StepRewardModel, rng: np.random.Generator, critic_first: bool
+        self, rollout: Rollout, reward: StepRewardModel, rng: np.random.Generator, critic_first: bool, left: float
     ) -> Metrics:
-        """Learn from one rollout."""
+        """Learn from one rollout, with what is `left` of the learning rate."""
         settings, objective = self._settings, self._settings.objective()
         rewards = learned_rewards(reward, rollout)
         batch, explained = self._batch(rollout, rewards)
         if critic_first and settings.critic_epochs:
             alone = replace(objective, policy=False)
-            update(
-                self.policy, self._optimizer, batch, self._minibatches(len(batch), settings.critic_epochs, rng), alone
-            )
+            self._update(batch, settings.critic_epochs, alone, left, rng)
             batch, explained = self._batch(rollout, rewards)  # advantages by the critic that knows the new reward
-        minibatches = self._minibatches(len(batch), settings.epochs, rng)
-        steps = update(self.policy, self._optimizer, batch, minibatches, objective)
+        steps = self._update(batch, settings.epochs, objective, left, rng)
         # Not before the update: actions were drawn under the old statistics, and the ratio must start at 1.
         self.policy.observe(rollout.observations)
         if settings.target_kl is not None:
             last = steps[-len(steps) // settings.epochs :]  # the last epoch's
             kl = float(np.mean([step["kl_old"] for step in last]))
-            steer(self._optimizer, kl, settings.target_kl, settings.learning_rate)
+            # A KL goes with the square of the steps: a rate that is to fall is not steered up for it.
+            steer(self._optimizer, kl / left**2, settings.target_kl, settings.learning_rate)
         means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
         # The first step's, where nothing has changed yet: anything but rounding is a bug.
         return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
+
+    def _update(
+        self, batch: Batch[Decisions], epochs: int, objective: Objective, left: float, rng: np.random.Generator
+    ) -> list[Metrics]:
+        with self._slowed(left):
+            return update(self.policy, self._optimizer, batch, self._minibatches(len(batch), epochs, rng), objective)
 
     @torch.no_grad()
     def _batch(self, rollout: Rollout, rewards: Floats) -> tuple[Batch[Decisions], float]:

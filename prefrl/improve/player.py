@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from prefrl.evaluate.policies import evaluation
+from prefrl.evaluate.policies import evaluation, returns
+from prefrl.improve.best import Best
 from prefrl.policies.rollout import Act, Rollout, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.types import Evaluation, Segment, State, Steps
+
+
+class Settled(NamedTuple):
+    """A policy to go back to, and how it does by the newest reward."""
+
+    weights: State
+    evaluation: Evaluation[Segment]
 
 
 class Player:
@@ -17,6 +27,8 @@ class Player:
     def __init__(self, task: ControlTask, most: int) -> None:
         self._task, self._most = task, most
         self._recent: Rollout | None = None
+        self._evaluated: Rollout | None = None
+        self.best = Best()
         self.rounds = 0
         self.steps = Steps()
 
@@ -39,12 +51,33 @@ class Player:
         """So many episodes, each in a fresh environment."""
         rollout = whole_episodes(self._task, act, episodes, rng)
         self.steps = self.steps.add(evaluate=rollout.ends.size)
+        self._evaluated = rollout
         return evaluation(self._task, rollout, reward)
+
+    def settle(self, weights: State, reward: RewardModel[Segment], most_lost: float) -> Settled | None:
+        """Keep the policy that was evaluated last where it is the best one; where it lost clearly, what to go back to.
+
+        `weights` are that policy's, and not to change.
+        """
+        assert self._evaluated is not None
+        undone = self.best.settle(self._evaluated, weights, self.rounds, reward, most_lost)
+        if undone is None or self.best.rollout is None or self.best.weights is None:
+            return None
+        found = evaluation(self._task, self.best.rollout, reward)
+        note = (
+            f"round {self.rounds} was undone: by the newest reward its episodes are worth {undone.after:.4g}, "
+            f"and those of round {undone.round} {undone.before:.4g}; the policy of that round stands again"
+        )
+        gold = float(returns(self._evaluated, reward).gold.mean())
+        metrics = found.metrics | {"undone_learned": undone.after, "undone_gold": gold}
+        return Settled(self.best.weights, Evaluation(metrics, found.examples, (note,)))
 
     def state(self) -> State:
         recent = None if self._recent is None else self._recent.state()
-        return {"recent": recent, "steps": list(self.steps), "rounds": self.rounds}
+        counted = {"steps": list(self.steps), "rounds": self.rounds}
+        return {"recent": recent, "best": self.best.state()} | counted
 
     def load(self, state: State) -> None:
         self._recent = None if state["recent"] is None else Rollout(**state["recent"])
         self.steps, self.rounds = Steps(*state["steps"]), state["rounds"]
+        self.best = Best.of(state["best"])
