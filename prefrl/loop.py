@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Generic
+from typing import Generic, Literal
 
 from pydantic import Field
 
@@ -32,7 +32,10 @@ class LoopSettings(Settings):
     With 0 the loop only improves and evaluates: for a reward model that was fitted before.
     """
     first_share: float = Field(0.25, gt=0, le=1)
-    """The share of the labels that is asked in the first round; the rest is spread evenly over the others."""
+    """The share of the labels that is asked in the first round."""
+    spread: Literal["constant", "hyperbolic", "front"] = "constant"
+    """How the rest is spread over the other rounds: evenly, or the n-th of them asks for 1 / n of what the first of them
+    does, or for 1 / n^2: while the policy changes most, labels are worth most."""
     pool: float = Field(4.0, ge=1)
     """Candidates sampled for each one that is asked about, for the selector to choose from."""
 
@@ -43,7 +46,9 @@ class LoopSettings(Settings):
         """How many labels have been asked for at the end of a round."""
         if round == 0 or self.rounds == 1:
             return self.labels * round
-        rest = (1 - self.first_share) * (round - 1) / (self.rounds - 1)
+        power = {"constant": 0, "hyperbolic": 1, "front": 2}[self.spread]
+        shares = [n**-power for n in range(1, self.rounds)]  # of the rounds after the first
+        rest = (1 - self.first_share) * sum(shares[: round - 1]) / sum(shares)
         return round_half_up(self.labels * (self.first_share + rest))
 
 

@@ -248,6 +248,9 @@ def test_labels_are_spread_as_the_settings_say() -> None:
     assert [settings.asked_by(n) for n in range(6)] == [0, 20, 40, 60, 80, 100]
     assert [LoopSettings(rounds=1, labels=7).asked_by(n) for n in range(2)] == [0, 7]
     assert LoopSettings(rounds=3, labels=10, first_share=1.0).asked_by(1) == 10
+    for spread, expected in {"hyperbolic": [10, 34, 46, 54, 60], "front": [10, 45, 54, 58, 60]}.items():
+        early = LoopSettings.model_validate({"rounds": 5, "labels": 60, "first_share": 1 / 6, "spread": spread})
+        assert [early.asked_by(n) for n in range(1, 6)] == expected
 
 
 def test_rankings_of_several_candidates_go_through_the_loop(tmp_path: Path) -> None:

@@ -72,8 +72,8 @@ class ControlLearnerSettings(Settings):
     """Extra passes for the critic alone at the start of a round, when the reward is new to it."""
     max_grad_norm: float = Field(0.5, gt=0)
     """A gradient that is longer is shortened to this."""
-    schedule: Literal["constant", "linear"] = "linear"
-    """Over the run the learning rate stays as it is, or falls to 0."""
+    schedule: Literal["constant", "linear", "late"] = "late"
+    """Over the run the learning rate stays as it is, falls to 0, or falls to 0 in the second half."""
     rollback: float | None = Field(0.25, ge=0)
     """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
     one; null keeps whatever comes."""
@@ -214,7 +214,8 @@ class ControlLearner:
     def _left(self, done: float) -> float:
         """What is left of the learning rate when that share of the round is done."""
         begin, end = self._span
-        return 1 - (begin + (end - begin) * done) if self._settings.schedule == "linear" else 1.0
+        left = 1 - (begin + (end - begin) * done)  # more than 0: the end itself is never reached
+        return {"constant": 1.0, "linear": left, "late": min(1.0, 2 * left)}[self._settings.schedule]
 
     @contextmanager
     def _slowed(self, left: float) -> Iterator[None]:
