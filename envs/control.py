@@ -7,18 +7,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from gymnasium.wrappers import FlattenObservation
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings, missing, suggest
 from prefrl.envs.fast.classic import CartPole, Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
-from prefrl.envs.fast.wrapped import Wrapped, is_mujoco, make
+from prefrl.envs.fast.wrapped import AfterEnd, Wrapped, is_mujoco, make
+from prefrl.envs.partial import Partial
+from prefrl.envs.spaces import Make, adapted
 from prefrl.protocols import Dynamics, Environments
 from prefrl.types import Floats, Segment
 
@@ -39,7 +40,9 @@ class ControlSettings(Settings):
 
     kind: Literal["control"] = "control"
     env: str = "Pendulum-v1"
-    """A registered gymnasium id. Pictures as observations, height by width by channels, are flattened."""
+    """A registered gymnasium id. Observations of several parts, choices and pictures become a row of numbers."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Keyword arguments of the environment, by name."""
     horizon: int | None = Field(None, gt=0)
     """Steps of an episode; the environment's own limit when left out."""
     segment_seconds: float | None = Field(None, gt=0)
@@ -48,6 +51,15 @@ class ControlSettings(Settings):
     """The same in control steps; give one of the two."""
     variable_horizon: bool = False
     """Let episodes end early. Their length then tells the policy how it was judged: read docs/control.md first."""
+    after_end: Literal["absorb", "restart"] = "absorb"
+    """Where an environment ends an episode and the horizon is fixed, it goes on in its last state, with a reward of 0,
+    or from a fresh start. MuJoCo's bodies and CartPole just go on as they fell."""
+    hide: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Which numbers of an observation the policy and the reward model do not see."""
+    flicker: float = Field(0.0, ge=0, lt=1)
+    """How probable it is that an observation is all zeros."""
+    stack: int = Field(1, ge=1)
+    """How many of the last observations are seen at once."""
     frame_size: int = Field(240, ge=16, le=2048)
     """Height and width of drawn frames, in pixels."""
     fps: float | None = Field(None, gt=0)
@@ -57,39 +69,68 @@ class ControlSettings(Settings):
         """Raises `ConfigError` for an unknown id, spaces that cannot be learned and impossible lengths."""
         single, probe = self._make()
         horizon, fps = self._horizon(), self._fps(probe)
-        observation, action = _observation_box(probe), _action_space(probe)
-        if len(observation.shape) > 1:
-            single = partial(_flat, single)
-        probe.close()
+        plain = adapted(single, probe)
+        env = plain()
+        # What is adapted, or has options, is not what the fast steppers step.
+        name = self.env if plain is single and not self.options else ""
+        action, size = env.action_space, math.prod(env.observation_space.shape or ())
+        after: AfterEnd = "end" if self.variable_horizon else self.after_end
+        environments = partial(_environments, name, plain, horizon, after)
+        if self.hide or self.flicker or self.stack > 1:
+            environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)
+        for one in (probe, env):
+            one.close()
+        segment, notes = self._segment_steps(horizon, fps)
         return GymnasiumTask(
             name=self.env,
             horizon=horizon,
-            segment_steps=self._segment_steps(horizon, fps),
-            observation_size=math.prod(observation.shape),
-            action_size=int(action.n) if isinstance(action, Discrete) else action.shape[0],
-            action_bounds=None if isinstance(action, Discrete) else _bounds(action),
+            segment_steps=segment,
+            observation_size=self._seen(size),
+            action_size=int(action.n) if isinstance(action, Discrete) else math.prod(action.shape or ()),
+            action_bounds=_bounds(action) if isinstance(action, Box) else None,
             fps=fps or 30.0,
             frame_size=self.frame_size,
-            make=partial(_environments, self.env, single, horizon, not self.variable_horizon),
+            make=environments,
+            notes=notes,
         )
 
-    def _make(self) -> tuple[Callable[[], gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]:
+    def _make(self) -> tuple[Make, gymnasium.Env[Any, Any]]:
         # Looked up here, not by gymnasium: an id "module:name" would make it import code that a config names.
         if self.env not in gymnasium.registry:
             raise ConfigError(f"task.env: unknown gymnasium environment {self.env!r}; {_nearest(self.env)}")
         options: dict[str, Any] = {"max_episode_steps": self._horizon(), "disable_env_checker": True}
         try:
             probe = make(self.env, **options)
-            accepted = inspect.signature(type(probe.unwrapped).__init__).parameters
-            if "terminate_when_unhealthy" in accepted and not self.variable_horizon:
-                # An episode that ends early tells by its length how it was judged.
-                options["terminate_when_unhealthy"] = False
-                probe = make(self.env, **options)
         except ModuleNotFoundError as error:
             raise ConfigError(f"task.env={self.env}: {missing(error)}") from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"task.env={self.env}: gymnasium cannot make it: {error}") from error
-        return partial(make, self.env, **options), probe
+        options |= self._own_options(_keywords(type(probe.unwrapped)))
+        single = partial(make, self.env, **options)
+        probe.close()
+        try:
+            return single, single()
+        except Exception as error:  # whatever an environment makes of a value that it does not know
+            raise ConfigError(f"task.options={self.options}: {self.env} says: {error}") from error
+
+    def _own_options(self, accepted: list[str]) -> dict[str, Any]:
+        """The environment's own keyword arguments. Raises `ConfigError` for one that it does not have."""
+        for name in self.options:
+            if name not in accepted:
+                raise ConfigError(f"task.options: {self.env} has no option {name!r}; {suggest(name, accepted)}")
+        # An episode that ends early tells by its length how it was judged.
+        fixed = "terminate_when_unhealthy" in accepted and not self.variable_horizon
+        return ({"terminate_when_unhealthy": False} if fixed else {}) | self.options
+
+    def _seen(self, size: int) -> int:
+        """How many numbers a policy sees of observations of that size."""
+        hidden = set(self.hide)
+        if any(i >= size for i in hidden) or len(hidden) == size:
+            raise ConfigError(
+                f"task.hide={list(self.hide)}: {self.env} has observations of {size} numbers, 0 to {size - 1}, "
+                "at least one of which has to be seen"
+            )
+        return (size - len(hidden)) * self.stack
 
     def _horizon(self) -> int:
         horizon = self.horizon or gymnasium.registry[self.env].max_episode_steps
@@ -105,18 +146,22 @@ class ControlSettings(Settings):
         rate = env.metadata.get("render_fps")
         return float(rate) if rate else None
 
-    def _segment_steps(self, horizon: int, fps: float | None) -> int:
+    def _segment_steps(self, horizon: int, fps: float | None) -> tuple[int, tuple[str, ...]]:
+        """How long segments are, and what to say of that."""
         if self.segment_steps and self.segment_seconds:
             raise ConfigError("task: give segment_steps or segment_seconds, not both")
         if not self.segment_steps and fps is None:
             raise ConfigError(f"task: {self.env} does not say how many steps make a second; give segment_steps or fps")
         steps = self.segment_steps or max(1, round((self.segment_seconds or SECONDS) * (fps or 0.0)))
+        if steps > horizon and not (self.segment_steps or self.segment_seconds):
+            steps = max(1, horizon // 2)
+            return steps, (f"segments have {steps} steps: an episode of {horizon} is shorter than {SECONDS:g} seconds",)
         if steps > horizon:
             raise ConfigError(
                 f"task: a segment of {steps} steps is longer than an episode of {horizon}; "
                 "make segment_steps (or segment_seconds) smaller, or horizon larger"
             )
-        return steps
+        return steps, ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +177,7 @@ class GymnasiumTask:
     fps: float
     frame_size: int
     make: Callable[[int], Environments]
+    notes: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -146,17 +192,38 @@ class GymnasiumTask:
         return frames(self.name, segment, self.frame_size)
 
 
-def _environments(
-    name: str, single: Callable[[], gymnasium.Env[Any, Any]], horizon: int, fixed_horizon: bool, count: int
-) -> Environments:
+def _environments(name: str, single: Make, horizon: int, after: AfterEnd, count: int) -> Environments:
     """The fastest stepper there is for an environment."""
     if name in WORLDS:
-        return Vectorised(WORLDS[name](not fixed_horizon), count, horizon)
+        return Vectorised(WORLDS[name](after == "end"), count, horizon)
     if name in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"):
         from prefrl.envs.fast.locomotion import Locomotion
 
-        return Locomotion(name, single, count, horizon, fixed_horizon)
-    return Wrapped(single, count, fixed_horizon)
+        return Locomotion(name, single, count, horizon, after != "end")
+    return Wrapped(single, count, horizon, after)
+
+
+def _partial(
+    environments: Callable[[int], Environments],
+    size: int,
+    hide: tuple[int, ...],
+    flicker: float,
+    stack: int,
+    count: int,
+) -> Environments:
+    return Partial(environments(count), size, hide, flicker, stack)
+
+
+def _keywords(env: type) -> list[str]:
+    """The names that a class of environments takes, those that it hands on to its bases among them."""
+    known: dict[str, None] = {}
+    for base in env.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
+            known |= {p.name: None for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+            if not any(p.kind == p.VAR_KEYWORD for p in parameters):
+                break
+    return [name for name in known if name != "self"]
 
 
 def _nearest(name: str) -> str:
@@ -164,31 +231,6 @@ def _nearest(name: str) -> str:
     stems = {k.rsplit("-v", 1)[0].lower(): k for k in known}
     # "pendulum" is nearest to Pendulum-v1, whatever the letters of "-v1" count for.
     return f"did you mean {found!r}?" if (found := stems.get(name.rsplit("-v", 1)[0].lower())) else suggest(name, known)
-
-
-def _observation_box(env: gymnasium.Env[Any, Any]) -> Box:
-    """Numbers in a row, or a picture (height, width, channels), which is taken apart row by row."""
-    space = env.observation_space
-    row = isinstance(space, Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
-    picture = isinstance(space, Box) and len(space.shape) == 3 and space.dtype in (np.uint8, np.float32, np.float64)
-    if not (row or picture):
-        raise ConfigError(
-            "task.env: observations must be a flat Box of floats, or a Box of pictures (height, width, channels), got "
-            f"{space}; wrap and register it so"
-        )
-    return space  # type: ignore[return-value]
-
-
-def _flat(make: Callable[[], gymnasium.Env[Any, Any]]) -> gymnasium.Env[Any, Any]:
-    return FlattenObservation(make())
-
-
-def _action_space(env: gymnasium.Env[Any, Any]) -> Box | Discrete:
-    space = env.action_space
-    flat = isinstance(space, Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
-    if not (flat or isinstance(space, Discrete)):
-        raise ConfigError(f"task.env: actions must be a flat Box of floats or Discrete, got {space}")
-    return space  # type: ignore[return-value]
 
 
 def _bounds(space: Box) -> tuple[Floats, Floats]:

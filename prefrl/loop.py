@@ -34,8 +34,8 @@ class LoopSettings(Settings):
     first_share: float = Field(0.25, gt=0, le=1)
     """The share of the labels that is asked in the first round."""
     spread: Literal["constant", "hyperbolic", "front"] = "constant"
-    """How the rest is spread over the other rounds: evenly, or the n-th of them asks for 1 / n of what the first of them
-    does, or for 1 / n^2: while the policy changes most, labels are worth most."""
+    """How the rest is spread over the other rounds: evenly, or the n-th of them asks for 1 / n, or 1 / n^2, of what the
+    first of them does: while the policy changes most, labels are worth most."""
     pool: float = Field(4.0, ge=1)
     """Candidates sampled for each one that is asked about, for the selector to choose from."""
 

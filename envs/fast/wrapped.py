@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -13,34 +13,50 @@ from prefrl.protocols import Transition
 from prefrl.seeding import draw_seed
 from prefrl.types import Bools, Floats
 
+AfterEnd: TypeAlias = Literal["absorb", "restart", "end"]
+"""What follows where an environment ends an episode before its horizon."""
+
 
 class Wrapped:
     """n gymnasium environments stepped in a loop; implements `prefrl.protocols.Environments`.
 
-    `build` makes one, its time limit included. With `fixed_horizon` a termination raises a ValueError: an episode
-    that ends early tells the reward model and the policy how it was judged (PITFALLS, control 1).
+    `build` makes one, its time limit included. An episode that the environment ends goes on to its horizon, or its
+    length would tell the reward model and the policy how it was judged: where it ended, with a reward of 0 a step
+    (`absorb`, as in seals), or from a fresh start, of which the learner is not told (`restart`). `end` lets it end.
     """
 
-    def __init__(self, build: Callable[[], gymnasium.Env[Any, Any]], count: int, fixed_horizon: bool) -> None:
+    def __init__(self, build: Callable[[], gymnasium.Env[Any, Any]], count: int, horizon: int, after: AfterEnd) -> None:
         self._envs = [build() for _ in range(count)]
-        self._fixed_horizon = fixed_horizon
+        self._horizon, self._after = horizon, after
         self._discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
+        self._last: Floats = np.zeros((count, 0), np.float32)
+        self._over = np.zeros(count, bool)
+        """Which episodes the environment has ended, and that go on in their last state."""
+        self._elapsed = np.zeros(count, np.int64)
 
     def reset(self, rng: np.random.Generator) -> Floats:
-        return np.stack([env.reset(seed=draw_seed(rng))[0] for env in self._envs]).astype(np.float32)
+        self._over[:], self._elapsed[:] = False, 0
+        self._last = np.stack([env.reset(seed=draw_seed(rng))[0] for env in self._envs]).astype(np.float32)
+        return self._last.copy()
 
     def step(self, actions: Floats) -> Transition:
-        chosen = [self._action(env, a) for env, a in zip(self._envs, actions, strict=True)]
-        steps = [env.step(a) for env, a in zip(self._envs, chosen, strict=True)]
-        final = np.stack([s[0] for s in steps]).astype(np.float32)
-        terminated = np.array([bool(s[2]) for s in steps])
-        truncated = np.array([bool(s[3]) for s in steps]) & ~terminated
-        if self._fixed_horizon and terminated.any():
-            raise ValueError(_early_end(self._envs[0]))
-        observations = final.copy()  # a reset must not change what the step led to
-        for i in np.flatnonzero(terminated | truncated):
-            observations[i] = self._envs[i].reset()[0]  # without a seed: the generator that `reset` seeded goes on
-        return Transition(observations, np.array([float(s[1]) for s in steps]), terminated, truncated, final)
+        final, rewards = self._last.copy(), np.zeros(len(actions))
+        terminated, truncated = np.zeros(len(actions), bool), np.zeros(len(actions), bool)
+        for i in np.flatnonzero(~self._over).tolist():
+            env = self._envs[i]
+            final[i], rewards[i], terminated[i], truncated[i], _ = env.step(self._action(env, actions[i]))
+            if terminated[i] and self._after == "restart":
+                final[i] = env.reset()[0]  # without a seed: the generator that `reset` seeded goes on
+        self._elapsed += 1
+        if self._after == "absorb":
+            self._over |= terminated
+        if self._after != "end":
+            terminated[:], truncated = False, truncated | (self._elapsed >= self._horizon)
+        ended = terminated | truncated
+        self._last = final.copy()  # a reset must not change what the step led to
+        for i in np.flatnonzero(ended).tolist():
+            self._last[i], self._over[i], self._elapsed[i] = self._envs[i].reset()[0], False, 0
+        return Transition(self._last.copy(), rewards, terminated, truncated & ~terminated, final)
 
     def states(self) -> Floats | None:
         rows = [physics_state(env) for env in self._envs]
@@ -92,12 +108,3 @@ def physics_state(env: gymnasium.Env[Any, Any]) -> Floats | None:
     state = np.empty(mujoco.mj_stateSize(unwrapped.model, mujoco.mjtState.mjSTATE_PHYSICS))
     mujoco.mj_getState(unwrapped.model, unwrapped.data, state, mujoco.mjtState.mjSTATE_PHYSICS)
     return state
-
-
-def _early_end(env: gymnasium.Env[Any, Any]) -> str:
-    name = env.spec.id if env.spec else str(env)
-    return (
-        f"{name} ended an episode before its horizon. Preferences fix a reward only up to a shift, so episodes of "
-        "unequal length leak or invert what was learned; choose an environment without terminations, or set "
-        "task.variable_horizon=true if you accept that"
-    )

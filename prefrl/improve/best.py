@@ -44,8 +44,8 @@ class Best:
     ) -> Undone | None:
         """Count an evaluated policy in, or say that it lost clearly and is to be undone.
 
-        Clearly: more than `most_lost` of all that was gained since the start, more than episodes differ by among each
-        other (a standard deviation), and more than chance (two standard errors of the paired difference).
+        Clearly: more than `most_lost` of all that was gained since the start, and more than chance (two standard errors
+        of the paired difference).
         """
         if self.start is None or self.rollout is None or not reward.fitted:
             self.start = self.start or rollout
@@ -78,4 +78,4 @@ def _lost(start: Floats, best: Floats, new: Floats, most_lost: float) -> bool:
     lost = best - new  # (n,) pairs: episodes of an evaluation begin alike in all rounds
     error = float(lost.std(ddof=1)) / np.sqrt(len(lost)) if len(lost) > 1 else 0.0
     gained = max(0.0, float(best.mean() - start.mean()))
-    return float(lost.mean()) > max(most_lost * gained, float(best.std()), ERRORS * error)
+    return float(lost.mean()) > max(most_lost * gained, ERRORS * error)

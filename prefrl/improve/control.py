@@ -74,7 +74,7 @@ class ControlLearnerSettings(Settings):
     """A gradient that is longer is shortened to this."""
     schedule: Literal["constant", "linear", "late"] = "late"
     """Over the run the learning rate stays as it is, falls to 0, or falls to 0 in the second half."""
-    rollback: float | None = Field(0.25, ge=0)
+    rollback: float | None = Field(0.1, ge=0)
     """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
     one; null keeps whatever comes."""
     hidden: tuple[int, ...] = (64, 64)

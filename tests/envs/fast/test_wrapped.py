@@ -5,17 +5,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import pytest
 
 from prefrl.envs.fast.classic import Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
-from prefrl.envs.fast.wrapped import Wrapped
+from prefrl.envs.fast.wrapped import AfterEnd, Wrapped
+from prefrl.protocols import Transition
 
 make_pendulum = partial(gymnasium.make, "Pendulum-v1", max_episode_steps=5, disable_env_checker=True)
 
 
 def test_it_steps_as_gymnasium_does_and_keeps_final_observations() -> None:
-    envs = Wrapped(make_pendulum, 2, fixed_horizon=True)
+    envs = Wrapped(make_pendulum, 2, 5, "absorb")
     first = envs.reset(np.random.default_rng(0))
     fast = Vectorised(Pendulum(), 2, 5)
     fast.reset(np.random.default_rng(0))
@@ -29,14 +29,41 @@ def test_it_steps_as_gymnasium_does_and_keeps_final_observations() -> None:
     assert not np.array_equal(slow.observations, slow.final_observations)
 
 
-def test_a_termination_under_a_fixed_horizon_is_an_error_that_names_the_setting() -> None:
-    envs = Wrapped(partial(gymnasium.make, "CartPole-v1", disable_env_checker=True), 1, fixed_horizon=True)
+def fallen(after: AfterEnd, steps: int) -> list[Transition]:
+    """A pole that is pushed to one side until it falls, after 9 or 10 steps."""
+    envs = Wrapped(partial(gymnasium.make, "CartPole-v1", disable_env_checker=True), 1, 30, after)
     envs.reset(np.random.default_rng(0))
-    right = np.array([[0.0, 1.0]], np.float32)
-    for _ in range(5):
-        envs.step(right)
-    with pytest.raises(ValueError, match=r"task\.variable_horizon=true"):
-        [envs.step(right) for _ in range(50)]
+    return [envs.step(np.array([[0.0, 1.0]], np.float32)) for _ in range(steps)]
+
+
+def test_an_episode_that_the_environment_ends_goes_on_where_it_ended_for_nothing() -> None:
+    steps = fallen("absorb", 31)
+    rewards = np.array([step.rewards[0] for step in steps])
+    length = int(rewards[:30].sum())
+    assert 8 <= length <= 11
+    assert rewards[:30].tolist() == [1.0] * length + [0.0] * (30 - length)
+    for step in steps[length:30]:
+        np.testing.assert_array_equal(step.final_observations, steps[length - 1].final_observations)
+    assert not any(step.terminated.any() for step in steps)
+    assert [i for i, step in enumerate(steps) if step.truncated.any()] == [29]
+    assert abs(steps[29].observations[0, 2]) < 0.05  # a fresh start
+    assert rewards[30] == 1.0
+
+
+def test_an_episode_that_the_environment_ends_may_go_on_from_a_fresh_start() -> None:
+    steps = fallen("restart", 30)
+    assert [step.rewards[0] for step in steps] == [1.0] * 30
+    assert max(abs(step.final_observations[0, 2]) for step in steps) < 0.3
+    assert [i for i, step in enumerate(steps) if step.truncated.any()] == [29]
+    assert not any(step.terminated.any() for step in steps)
+
+
+def test_an_episode_may_end() -> None:
+    steps = fallen("end", 20)
+    first = next(i for i, step in enumerate(steps) if step.terminated.any())
+    assert 8 <= first + 1 <= 11
+    assert abs(steps[first].final_observations[0, 2]) > 0.2
+    assert abs(steps[first].observations[0, 2]) < 0.05
 
 
 def test_a_discrete_action_may_start_at_any_number() -> None:
@@ -52,7 +79,7 @@ def test_a_discrete_action_may_start_at_any_number() -> None:
         def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
             return np.array([action], np.float32), 0.0, False, False, {}
 
-    envs = Wrapped(Echo, 3, fixed_horizon=True)
+    envs = Wrapped(Echo, 3, 10, "absorb")
     envs.reset(np.random.default_rng(0))
     assert envs.step(np.eye(3, dtype=np.float32)).observations.ravel().tolist() == [-1.0, 0.0, 1.0]
     assert envs.states() is None
