@@ -448,6 +448,9 @@ class Settles(Protocol[C]):
     def settle(self, reward: RewardModel[C]) -> Evaluation[C] | None:
         """After an evaluation: None, or how the policy does that stands again."""
 
+    def go_back(self) -> int:
+        """Take up the best policy so far; returns the round that it is of."""
+
 
 @runtime_checkable
 class Paced(Protocol):

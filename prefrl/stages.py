@@ -23,7 +23,7 @@ from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
-from prefrl.protocols import Attended, Labeler, RewardModel, TextTask, text
+from prefrl.protocols import Attended, Labeler, RewardModel, Settles, TextTask, text
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
@@ -273,8 +273,11 @@ def with_reward(config: Config, saved: Path) -> Config:
     return config.model_copy(update=update)
 
 
-def evaluate(folder: Path) -> Evaluation:
-    """Evaluate the newest policy of a run, with its reward model."""
+def evaluate(folder: Path, best: bool = False) -> tuple[Evaluation, int]:
+    """Evaluate the newest policy of a run, or the best one by its newest reward; also returns the round that it is of.
+
+    Raises `RunError` for the best one of a learner that keeps none.
+    """
     saved = open_saved(folder)
     task = saved.config.build_task()
     learner = saved.config.build_learner(task, streams(saved.config.seed, 0).build)
@@ -282,8 +285,15 @@ def evaluate(folder: Path) -> Evaluation:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
         raise RunError(f"{folder}: {error}") from error
+    round = json.loads((saved.folder / "loop.json").read_text())["round"]
+    if best:
+        if not isinstance(learner, Settles):
+            raise RunError(
+                f"{folder}: learner.kind={saved.config.learner.kind} keeps no best policy beside the last one"
+            )
+        round = learner.go_back()
     evaluation: Evaluation = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
-    return evaluation
+    return evaluation, round
 
 
 def report_card(

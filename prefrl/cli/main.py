@@ -183,6 +183,9 @@ def improve(
 @app.command()
 def evaluate(
     folder: Annotated[Path | None, typer.Argument(help="A run, whose policy is evaluated.", show_default=False)] = None,
+    best: Annotated[
+        bool, typer.Option("--best", help="The best policy by the newest reward, in place of the last one: control.")
+    ] = False,
     reward: Annotated[
         Path | None, typer.Option(help="Grade this reward model instead: a run, or what `prefrl fit` wrote.")
     ] = None,
@@ -208,7 +211,9 @@ def evaluate(
         stages.write_card(card, json_, html)
         console.print(card_table(card))
     elif folder is not None:
-        console.print(metrics_table(f"policy of {folder}", stages.evaluate(folder).metrics))
+        found, round = stages.evaluate(folder, best)
+        said = "best" if best else "last"
+        console.print(metrics_table(f"{said} policy of {folder}, after round {round}", found.metrics))
     else:
         raise typer.BadParameter("say what to evaluate: a run's FOLDER, or --reward FOLDER")
 

@@ -187,12 +187,18 @@ class ControlLearner:
         if self._settings.rollback is None:
             return None
         weights = {"policy": self.policy.state(), "optimizer": deepcopy(self._optimizer.state_dict())}
-        settled = self._player.settle(weights, reward, self._settings.rollback)
-        if settled is None:
-            return None
-        self.policy.load(settled.weights["policy"])
-        self._optimizer.load_state_dict(settled.weights["optimizer"])
-        return settled.evaluation
+        undone = self._player.settle(weights, reward, self._settings.rollback)
+        if undone is not None:
+            self.go_back()
+        return undone
+
+    def go_back(self) -> int:
+        best = self._player.best
+        if best.weights is not None:
+            self.policy.load(best.weights["policy"])
+            # A copy: the optimiser goes on writing into what it is given.
+            self._optimizer.load_state_dict(deepcopy(best.weights["optimizer"]))
+        return best.round if best.weights is not None else self._player.rounds
 
     def pace(self, begin: float, end: float) -> None:
         self._span = begin, end

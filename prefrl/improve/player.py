@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from prefrl.evaluate.policies import evaluation, returns
@@ -12,13 +10,6 @@ from prefrl.policies.rollout import Act, Rollout, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.types import Evaluation, Segment, State, Steps
-
-
-class Settled(NamedTuple):
-    """A policy to go back to, and how it does by the newest reward."""
-
-    weights: State
-    evaluation: Evaluation[Segment]
 
 
 class Player:
@@ -54,14 +45,14 @@ class Player:
         self._evaluated = rollout
         return evaluation(self._task, rollout, reward)
 
-    def settle(self, weights: State, reward: RewardModel[Segment], most_lost: float) -> Settled | None:
-        """Keep the policy that was evaluated last where it is the best one; where it lost clearly, what to go back to.
+    def settle(self, weights: State, reward: RewardModel[Segment], most_lost: float) -> Evaluation[Segment] | None:
+        """Keep the policy that was evaluated last where it is the best one; where it lost clearly, how that one does.
 
         `weights` are that policy's, and not to change.
         """
         assert self._evaluated is not None
         undone = self.best.settle(self._evaluated, weights, self.rounds, reward, most_lost)
-        if undone is None or self.best.rollout is None or self.best.weights is None:
+        if undone is None or self.best.rollout is None:
             return None
         found = evaluation(self._task, self.best.rollout, reward)
         note = (
@@ -70,7 +61,7 @@ class Player:
         )
         gold = float(returns(self._evaluated, reward).gold.mean())
         metrics = found.metrics | {"undone_learned": undone.after, "undone_gold": gold}
-        return Settled(self.best.weights, Evaluation(metrics, found.examples, (note,)))
+        return Evaluation(metrics, found.examples, (note,))
 
     def state(self) -> State:
         recent = None if self._recent is None else self._recent.state()
