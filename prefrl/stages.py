@@ -288,9 +288,7 @@ def evaluate(folder: Path, best: bool = False) -> tuple[Evaluation, int]:
     round = json.loads((saved.folder / "loop.json").read_text())["round"]
     if best:
         if not isinstance(learner, Settles):
-            raise RunError(
-                f"{folder}: learner.kind={saved.config.learner.kind} keeps no best policy beside the last one"
-            )
+            raise RunError(f"{folder}: its learner ({type(learner).__name__}) keeps no best policy beside the last one")
         round = learner.go_back()
     evaluation: Evaluation = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
     return evaluation, round

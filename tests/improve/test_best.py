@@ -132,7 +132,7 @@ def test_a_learner_that_keeps_none_has_no_best_policy(tmp_path: Path) -> None:
     config = shrink(Config.load("control/toy", ["learner.kind=sb3", "learner.steps_per_round=128"]))
     with Run(config, tmp_path / "run") as run:
         list(run)
-    with pytest.raises(RunError, match="a SB3 keeps no best policy"):
+    with pytest.raises(RunError, match=r"learner \(SB3\) keeps no best policy"):
         evaluate(tmp_path / "run", best=True)
 
 
