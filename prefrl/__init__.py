@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from prefrl.judgements import Rating as Rating
     from prefrl.judgements import Skip as Skip
     from prefrl.rundir import Run as Run
+    from prefrl.stages import load_policy as load_policy
     from prefrl.types import Query as Query
     from prefrl.types import Response as Response
     from prefrl.types import Segment as Segment
@@ -29,10 +30,12 @@ __all__ = [
     "Run",
     "Segment",
     "Skip",
+    "load_policy",
 ]
 _MODULES = {
     "Config": "prefrl.config",
     "Run": "prefrl.rundir",
+    "load_policy": "prefrl.stages",
     "Batch": "prefrl.fit.pairs",
     **dict.fromkeys(("Choice", "Comparison", "Ranking", "Rating", "Skip"), "prefrl.judgements"),
 }

@@ -103,6 +103,7 @@ EXTRAS = {
     "gymnasium": "control",
     "mujoco": "control",
     "stable_baselines3": "control",
+    "sb3_contrib": "control",
     "transformers": "text",
     "tokenizers": "text",
     "datasets": "text",

@@ -6,6 +6,7 @@ Interfaces only; nothing inherits from them. Every component that fits one can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import numpy as np
@@ -450,6 +451,17 @@ class Settles(Protocol[C]):
 
     def go_back(self) -> int:
         """Take up the best policy so far; returns the round that it is of."""
+
+
+@runtime_checkable
+class Acts(Protocol):
+    """A learner whose policy acts in environments."""
+
+    def actor(self) -> Callable[[Floats, np.random.Generator | None], Floats]:
+        """(n, O) observations -> (n, A) actions to execute: the policy's mode, or drawn where there is a generator."""
+
+    def save(self, path: Path) -> None:
+        """Write the policy as stable-baselines3 does."""
 
 
 @runtime_checkable

@@ -23,7 +23,8 @@ from prefrl.exchange.source import open_judgements
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
-from prefrl.protocols import Attended, Labeler, RewardModel, Settles, TextTask, text
+from prefrl.policies.loaded import Loaded
+from prefrl.protocols import Acts, Attended, Labeler, RewardModel, Settles, TextTask, text
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.seeding import streams
@@ -273,11 +274,31 @@ def with_reward(config: Config, saved: Path) -> Config:
     return config.model_copy(update=update)
 
 
-def evaluate(folder: Path, best: bool = False) -> tuple[Evaluation, int]:
-    """Evaluate the newest policy of a run, or the best one by its newest reward; also returns the round that it is of.
+def load_policy(folder: str | Path, best: bool = False) -> Loaded:
+    """The last policy of a run of control, or the best one by its newest reward; `predict` acts with it.
 
-    Raises `RunError` for the best one of a learner that keeps none.
+    Raises `RunError` for a run of text, and for the best one of a learner that keeps none.
     """
+    learner, task, _ = _learner_of(Path(folder), best)
+    if not isinstance(learner, Acts):
+        raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
+    return Loaded(learner.actor(), task.observation_size, task.action_bounds is None)
+
+
+def export_sb3(folder: Path, to: Path, best: bool = False) -> int:
+    """Write a run's policy of control as a zip of stable-baselines3; returns the round that it is of.
+
+    Raises `RunError` as `load_policy` does.
+    """
+    learner, _, round = _learner_of(folder, best)
+    if not isinstance(learner, Acts):
+        raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
+    learner.save(to)
+    return round
+
+
+def _learner_of(folder: Path, best: bool) -> tuple[Any, Any, int]:
+    """A run's learner with its last policy, or its best one; its task, and the round that the policy is of."""
     saved = open_saved(folder)
     task = saved.config.build_task()
     learner = saved.config.build_learner(task, streams(saved.config.seed, 0).build)
@@ -285,11 +306,20 @@ def evaluate(folder: Path, best: bool = False) -> tuple[Evaluation, int]:
         learner.load(load_state(saved.folder, "learner"))
     except ValueError as error:
         raise RunError(f"{folder}: {error}") from error
-    round = json.loads((saved.folder / "loop.json").read_text())["round"]
-    if best:
-        if not isinstance(learner, Settles):
-            raise RunError(f"{folder}: its learner ({type(learner).__name__}) keeps no best policy beside the last one")
-        round = learner.go_back()
+    if not best:
+        return learner, task, json.loads((saved.folder / "loop.json").read_text())["round"]
+    if not isinstance(learner, Settles):
+        raise RunError(f"{folder}: its learner ({type(learner).__name__}) keeps no best policy beside the last one")
+    return learner, task, learner.go_back()
+
+
+def evaluate(folder: Path, best: bool = False) -> tuple[Evaluation, int]:
+    """Evaluate the newest policy of a run, or the best one by its newest reward; also returns the round that it is of.
+
+    Raises `RunError` for the best one of a learner that keeps none.
+    """
+    saved = open_saved(folder)
+    learner, task, round = _learner_of(folder, best)
     evaluation: Evaluation = learner.evaluate(saved.reward(task), streams(saved.config.seed, 0).evaluate)
     return evaluation, round
 

@@ -42,6 +42,7 @@ class Form(StrEnum):
     classifier = "classifier"
     policy = "policy"
     adapter = "adapter"
+    sb3 = "sb3"
 
 
 class Ties(StrEnum):
@@ -69,11 +70,12 @@ def export_(
     store: Annotated[Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`.", exists=True)],
     to: Annotated[Path, typer.Option(help="A folder for dataset, minari, bundle and models, else a file.")],
     form: Annotated[
-        Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a model for transformers.")
+        Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a model.")
     ] = Form.preferences,
     ties: Annotated[Ties, typer.Option(help="In the columns of TRL: leave ties out, or write them both ways.")] = (
         Ties.drop
     ),
+    best: Annotated[bool, typer.Option("--best", help="With sb3: the best policy, in place of the last one.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Write judgements, a reward model of text or a policy to files, and say what these could not hold."""
@@ -92,6 +94,12 @@ def export_(
         policy_of(store).save(to, adapter=form is Form.adapter)
         loads = "PeftModel.from_pretrained" if form is Form.adapter else "AutoModelForCausalLM.from_pretrained"
         say(f"{to}: the newest policy, with its tokenizer; {loads} reads it")
+        return
+    if form is Form.sb3:
+        from prefrl.stages import export_sb3
+
+        round = export_sb3(store, to, best)
+        say(f"{to}: the policy after round {round}; stable-baselines3 loads it, and it acts on raw observations")
         return
     from prefrl.exchange.ports import export
     from prefrl.store import Store

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from prefrl.components import Settings, filled_in
 from prefrl.improve.gradient import Batch, adam_of, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
+from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import Decisions, MLPPolicy
 from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
@@ -202,6 +204,16 @@ class ControlLearner:
 
     def pace(self, begin: float, end: float) -> None:
         self._span = begin, end
+
+    def actor(self) -> Actor:
+        actor = self.policy.numpy_actor()
+        return lambda observations, rng: actor(observations, rng)[1]
+
+    def save(self, path: Path) -> None:
+        """As a zip of stable-baselines3's PPO, which acts as this policy does."""
+        from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
+
+        save_ppo(self.policy, self._task, self._settings.hidden, path)
 
     def state(self) -> State:
         return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()} | self._player.state()

@@ -9,39 +9,68 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Any, Literal
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from pydantic import Field, JsonValue
-from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from prefrl.components import ConfigError, Settings
+from prefrl.components import ConfigError, Settings, missing
 from prefrl.improve.player import Player
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
+from prefrl.policies.loaded import Actor
 from prefrl.policies.rollout import Act, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
-ALGORITHMS = {"PPO": PPO, "SAC": SAC}
-PPO_STEPS = 2048
-"""stable-baselines3's default `n_steps`."""
+Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN"]
+
+
+class Algorithm(NamedTuple):
+    """What an algorithm can do, and its defaults."""
+
+    package: str
+    at_once: int
+    """Steps in each environment between two updates: `n_steps` where it learns from rollouts, else `train_freq`."""
+    replays: bool = True
+    """Whether it learns from a replay buffer, which is relabelled after each fit of the reward."""
+    actions: Literal["any", "box", "discrete"] = "box"
+    batch: int = 0
+    """The default `batch_size` of one that learns from rollouts."""
+
+
+ALGORITHMS: dict[Name, Algorithm] = {
+    "PPO": Algorithm("stable_baselines3", 2048, replays=False, actions="any", batch=64),
+    "A2C": Algorithm("stable_baselines3", 5, replays=False, actions="any"),
+    "TRPO": Algorithm("sb3_contrib", 2048, replays=False, actions="any", batch=128),
+    "SAC": Algorithm("stable_baselines3", 1),
+    "TD3": Algorithm("stable_baselines3", 1),
+    "DDPG": Algorithm("stable_baselines3", 1),
+    "TQC": Algorithm("sb3_contrib", 1),
+    "CrossQ": Algorithm("sb3_contrib", 1),
+    "DQN": Algorithm("stable_baselines3", 4, actions="discrete"),
+}
+OF_TASK = {"any": "any actions", "box": "continuous actions", "discrete": "discrete actions"}
 BATCH = 64
-"""The default `batch_size` of its PPO."""
+"""Steps that a trial run takes in all."""
 DISCOUNT = 0.99
 """The default `gamma` of its algorithms."""
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 class SB3Settings(Settings):
-    """stable-baselines3's PPO or SAC on the learned reward."""
+    """An algorithm of stable-baselines3 or sb3-contrib on the learned reward."""
 
     kind: Literal["sb3"] = "sb3"
-    algorithm: Literal["PPO", "SAC"] = "PPO"
-    """Which one of stable-baselines3's."""
+    algorithm: Name = "PPO"
+    """Which one; DQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the others for both."""
     environments: int = Field(8, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
@@ -56,12 +85,13 @@ class SB3Settings(Settings):
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
 
     def shrunk(self) -> SB3Settings:
-        """One rollout of a batch in each environment for PPO; for SAC about as many steps, learning from the first."""
+        """One rollout of a batch in each environment; with a replay buffer about as many, learning from the first."""
         if self.steps_per_round % (self.at_once * self.environments):
             return self  # building it says what is wrong
         options: dict[str, Any] = dict(self.options)
-        if self.algorithm == "PPO":
-            options["n_steps"] = each = min(self.at_once, options.get("batch_size", BATCH))
+        known = ALGORITHMS[self.algorithm]
+        if not known.replays:
+            options["n_steps"] = each = min(self.at_once, options.get("batch_size", known.batch) or self.at_once)
         else:
             options["learning_starts"] = 0  # else a trial run would end before the first gradient step
             each = min(self.steps_per_round // self.environments, self.at_once * max(1, BATCH // self.at_once))
@@ -84,15 +114,21 @@ class SB3Settings(Settings):
     def at_once(self) -> int:
         """Steps that the algorithm collects in each environment between two updates."""
         options: dict[str, Any] = self.options
-        if self.algorithm == "PPO":
-            return int(options.get("n_steps", min(PPO_STEPS, max(self.steps_per_round // self.environments, 1))))
-        return int(options.get("train_freq", 1))
+        known = ALGORITHMS[self.algorithm]
+        if known.replays:
+            return int(options.get("train_freq", known.at_once))
+        return int(options.get("n_steps", min(known.at_once, max(self.steps_per_round // self.environments, 1))))
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
         found = control(task, f"learner kind {self.kind!r} acts in control tasks")
-        if self.algorithm == "SAC" and found.action_bounds is None:
-            raise ConfigError("learner.algorithm=SAC needs continuous actions; use PPO")
+        wanted, here = ALGORITHMS[self.algorithm].actions, "discrete" if found.action_bounds is None else "box"
+        if wanted not in ("any", here):
+            fitting = [name for name, known in ALGORITHMS.items() if known.actions in ("any", here)]
+            raise ConfigError(
+                f"learner.algorithm={self.algorithm} needs {OF_TASK[wanted]}, and {found.name} has {OF_TASK[here]}; "
+                f"use one of {', '.join(fitting)}"
+            )
         return SB3(self, found, rng)
 
     def formula(self) -> str:
@@ -109,7 +145,7 @@ class SB3:
     """
 
     def __init__(self, settings: SB3Settings, task: ControlTask, rng: np.random.Generator) -> None:
-        self._settings = settings
+        self._settings, self._replays = settings, ALGORITHMS[settings.algorithm].replays
         self._player = Player(task, settings.environments)
         self._env = TaskEnv(task, settings.environments)
         self._learned = LearnedReward(self._env, None)
@@ -131,7 +167,7 @@ class SB3:
         """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
         self._learned.learned = step_rewards(reward)
         # Before learning: the buffer holds what the reward model said before its last fit.
-        if isinstance(self.model, SAC):
+        if self._replays:
             relabel(self.model.replay_buffer, step_rewards(reward))
         self._env.start(rng)
         self.model._last_obs = None  # makes learn() reset the environments
@@ -149,14 +185,21 @@ class SB3:
         act = self._act(deterministic=True)
         return self._player.evaluate(self._settings.evaluation_episodes, act, reward, rng)
 
+    def actor(self) -> Actor:
+        return lambda observations, rng: self._act(deterministic=rng is None)(observations, None)[1]
+
+    def save(self, path: Path) -> None:
+        """As stable-baselines3 saves it: `SAC.load` and its like read it."""
+        self.model.save(path)
+
     def state(self) -> State:
         names, variables = self.model._get_torch_save_params()
-        counters = {name: getattr(self.model, name) for name in ("num_timesteps", "_n_updates", "_episode_num")}
+        counters = {name: getattr(self.model, name) for name in COUNTERS if hasattr(self.model, name)}
         return {
             "modules": {name: _attribute(self.model, name).state_dict() for name in names},
             "variables": {name: getattr(self.model, name).detach().clone() for name in variables},
             "counters": counters,
-            "replay": _replay_state(self.model.replay_buffer) if isinstance(self.model, SAC) else None,
+            "replay": _replay_state(self.model.replay_buffer) if self._replays else None,
         } | self._player.state()
 
     def load(self, state: State) -> None:
@@ -166,7 +209,7 @@ class SB3:
             getattr(self.model, name).data.copy_(value)
         for name, value in state["counters"].items():
             setattr(self.model, name, value)
-        if isinstance(self.model, SAC):
+        if self._replays:
             _load_replay(self.model.replay_buffer, state["replay"])
         self._player.load(state)
 
@@ -196,13 +239,22 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
         np.random.set_state(numpy_)
 
 
+def algorithm_class(name: Name) -> type[BaseAlgorithm]:
+    """Raises `ConfigError` where its package is not installed."""
+    try:
+        found: type[BaseAlgorithm] = getattr(import_module(ALGORITHMS[name].package), name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"learner.algorithm={name}: {missing(error)}") from error
+    return found
+
+
 def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
     options = dict(settings.options)
-    if settings.algorithm == "PPO":
+    if not ALGORITHMS[settings.algorithm].replays:
         options.setdefault("n_steps", settings.at_once)
     try:
         device = device_of(settings.device)
-        return ALGORITHMS[settings.algorithm](
+        return algorithm_class(settings.algorithm)(
             "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device=device, verbose=0, **options
         )
     except TypeError as error:  # an option that its constructor does not have

@@ -15,11 +15,23 @@ from stable_baselines3 import PPO as SB3PPO
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
-from prefrl.improve.sb3 import ALGORITHMS, SB3, LearnedReward, SB3Settings, TaskEnv, executed, relabel
+from prefrl.improve import sb3
+from prefrl.improve.sb3 import (
+    ALGORITHMS,
+    SB3,
+    LearnedReward,
+    Name,
+    SB3Settings,
+    TaskEnv,
+    algorithm_class,
+    executed,
+    relabel,
+)
 from prefrl.policies.rollout import learned_rewards
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
@@ -34,6 +46,50 @@ SAC_: dict[str, Any] = {
     "options": {"train_freq": 5, "gradient_steps": 2, "learning_starts": 20, "batch_size": 16, "buffer_size": 150},
 }
 both = pytest.mark.parametrize("algorithm", [PPO, SAC_], ids=["PPO", "SAC"])
+REPLAYS: dict[str, Any] = {"train_freq": 5, "gradient_steps": 2, "learning_starts": 20, "batch_size": 16}
+every = pytest.mark.parametrize("name", ALGORITHMS)
+
+
+def _settings(name: Name) -> dict[str, Any]:
+    """Small ones of any algorithm."""
+    options = REPLAYS | {"buffer_size": 150} if ALGORITHMS[name].replays else {"n_steps": 20}
+    return {"algorithm": name, "options": options | ({"batch_size": 40} if ALGORITHMS[name].batch else {})}
+
+
+def _task(name: Name) -> GymnasiumTask:
+    return point(discrete=ALGORITHMS[name].actions == "discrete")
+
+
+@every
+def test_any_algorithm_learns_and_goes_on_bit_for_bit_where_it_was_saved(
+    store: Store[Segment], name: Name, tmp_path: Any
+) -> None:
+    learner = _learner(_task(name), _settings(name))
+    before = _bytes(learner)
+    learner.improve(Known(), store, np.random.default_rng(0))
+    assert _bytes(learner) != before
+    save_state(tmp_path, "learner", learner.state())
+    other = _learner(_task(name), _settings(name), seed=7)
+    other.load(load_state(tmp_path, "learner"))
+    for one in (learner, other):
+        one.improve(Known(), store, np.random.default_rng(2))
+    assert _bytes(learner) == _bytes(other)
+    assert np.isfinite(learner.evaluate(Known(), np.random.default_rng(3)).metrics["gold"])
+
+
+@every
+def test_the_table_says_of_algorithms_what_is_so(name: Name) -> None:
+    known, parameters = ALGORITHMS[name], signature(algorithm_class(name)).parameters
+    assert issubclass(algorithm_class(name), OffPolicyAlgorithm) is known.replays
+    assert parameters["train_freq" if known.replays else "n_steps"].default == known.at_once
+    assert not known.batch or parameters["batch_size"].default == known.batch
+
+
+def test_actions_that_an_algorithm_cannot_take_are_refused_with_those_that_can() -> None:
+    with pytest.raises(ConfigError, match=r"DQN needs discrete .* has continuous actions; use one of PPO, .*SAC"):
+        _learner(point(), _settings("DQN"))
+    with pytest.raises(ConfigError, match=r"algorithm=TD3 needs continuous .* use one of PPO, A2C, TRPO, DQN"):
+        _learner(point(discrete=True), _settings("TD3"))
 
 
 def _learner(task: GymnasiumTask, algorithm: dict[str, Any], seed: int = 0, **settings: object) -> SB3:
@@ -47,8 +103,8 @@ def _bytes(learner: SB3) -> bytes:
 
 def test_the_discount_is_what_stable_baselines3_calls_gamma() -> None:
     assert SB3Settings(options={"gamma": 0.9}).discount == 0.9
-    for name, algorithm in ALGORITHMS.items():
-        default = signature(algorithm).parameters["gamma"].default
+    for name in ALGORITHMS:
+        default = signature(algorithm_class(name)).parameters["gamma"].default
         assert SB3Settings.model_validate({"algorithm": name}).discount == default
 
 
@@ -58,8 +114,7 @@ def test_the_algorithm_computes_on_the_device_that_the_settings_name(
 ) -> None:
     made: list[torch.device] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    name = algorithm["algorithm"]
-    monkeypatch.setitem(ALGORITHMS, name, lambda *_, device, **__: made.append(device))
+    monkeypatch.setattr(sb3, "algorithm_class", lambda _: lambda *_, device, **__: made.append(device))
     for device in ("cpu", "cuda", "auto"):
         _learner(point(), algorithm, device=device)
     assert [device.type for device in made] == ["cpu", "cuda", "cuda"]
@@ -239,11 +294,6 @@ def test_steps_that_the_algorithm_would_overshoot_are_refused() -> None:
 def test_an_option_that_the_algorithm_does_not_have_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="learning_rat"):
         _learner(point(), {"algorithm": "PPO", "options": {"learning_rat": 1.0}})
-
-
-def test_sac_needs_continuous_actions() -> None:
-    with pytest.raises(ConfigError, match="use PPO"):
-        _learner(point(discrete=True), SAC_)
 
 
 def test_the_algorithm_is_stable_baselines3s_own() -> None:

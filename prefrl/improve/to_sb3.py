@@ -1,0 +1,66 @@
+"""Our own policy as a zip of stable-baselines3's PPO: the same actions from raw observations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Space
+from stable_baselines3 import PPO
+from torch import Tensor
+
+from prefrl.improve.vec_env import TaskEnv
+from prefrl.policies.mlp import MLPPolicy
+from prefrl.protocols import ControlTask
+from prefrl.seeding import to_numpy
+from prefrl.types import Floats
+
+
+def save_ppo(policy: MLPPolicy, task: ControlTask, hidden: tuple[int, ...], path: Path) -> None:
+    """Write what `PPO.load` reads.
+
+    The observation's normaliser is folded into the first layers and the bounds' box into the actor's last, since PPO
+    has neither. Two things are lost: our clip of observations at 10 standard deviations, and Adam's moments.
+    """
+    settings: dict[str, Any] = {"net_arch": {"pi": list(hidden), "vf": list(hidden)}, "activation_fn": torch.nn.Tanh}
+    model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings)
+    model.observation_space = model.policy.observation_space = _observations(task, model.observation_space)
+    model.policy.load_state_dict(_folded(policy, len(hidden)))
+    model.save(path)
+
+
+def _observations(task: ControlTask, plain: Space[Any]) -> Space[Any]:
+    """The environment's own space where the task shows all of it as it is: PPO compares it with that of an `env`."""
+    if task.name in gymnasium.registry:
+        env = gymnasium.make(task.name)
+        own = env.observation_space
+        env.close()
+        if isinstance(own, Box) and own.shape == plain.shape:
+            return own
+    return plain
+
+
+def _folded(policy: MLPPolicy, hidden: int) -> dict[str, Tensor]:
+    """PPO's state, worked out in float64."""
+    named: dict[str, Floats] = {k: to_numpy(p).astype(np.float64) for k, p in policy.named().items()}
+    scale = 1.0 / np.sqrt(policy.variance + 1e-8)
+    found: dict[str, Floats] = {}
+    for net, body, head in (("actor", "policy_net", "action_net"), ("critic", "value_net", "value_net")):
+        layers = [(named[f"{net}_{2 * i}"], named[f"{net}_{2 * i + 1}"]) for i in range(hidden + 1)]
+        weight, bias = layers[0]
+        layers[0] = weight * scale, bias - weight @ (policy.mean * scale)
+        if net == "actor" and policy.space.middle is not None and policy.space.half is not None:
+            weight, bias = layers[-1]
+            half = policy.space.half.astype(np.float64)
+            layers[-1] = weight * half[:, None], bias * half + policy.space.middle
+            found["log_std"] = named["log_std"] + np.log(half)
+        for i, (weight, bias) in enumerate(layers):
+            name = head if i == hidden else f"mlp_extractor.{body}.{2 * i}"
+            found[f"{name}.weight"], found[f"{name}.bias"] = weight, bias
+    return {name: torch.from_numpy(np.ascontiguousarray(x)).float() for name, x in found.items()}
+
+
+__all__ = ["save_ppo"]

@@ -1,0 +1,51 @@
+"""A finished policy of control, to act with in a script of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from prefrl.types import Floats
+
+Actor: TypeAlias = Callable[[Floats, np.random.Generator | None], Floats]
+"""(n, O) observations -> (n, A) actions to execute: the policy's mode, or drawn where there is a generator."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Acts like a policy of stable-baselines3, so that what evaluates those evaluates this one."""
+
+    actor: Actor
+    observation_size: int
+    discrete: bool
+
+    def predict(
+        self,
+        observation: npt.ArrayLike,
+        state: None = None,
+        episode_start: npt.ArrayLike | None = None,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[npt.NDArray[Any], None]:
+        """(O,) or (n, O) raw observations -> actions (A,) or (n, A), whole numbers where they are discrete; and None.
+
+        `rng`: what is drawn from where the policy is not `deterministic`. `state` and `episode_start` are there for
+        those who pass them on: this policy has no memory. Raises ValueError for observations of another size.
+        """
+        rows = np.atleast_2d(np.asarray(observation, np.float32))
+        if rows.ndim != 2 or rows.shape[1] != self.observation_size:
+            shape = np.shape(observation)
+            raise ValueError(
+                f"observations must be ({self.observation_size},) or (n, {self.observation_size}), got {shape}"
+            )
+        drawn = None if deterministic else rng or np.random.default_rng()
+        actions = self.actor(rows, drawn)
+        found = actions.argmax(1) if self.discrete else actions
+        return (found[0] if np.ndim(observation) == 1 else found), None
+
+
+__all__ = ["Actor", "Loaded"]
