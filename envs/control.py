@@ -15,7 +15,8 @@ from gymnasium.spaces import Box, Discrete
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings, missing, suggest
-from prefrl.envs.fast.classic import CartPole, Pendulum
+from prefrl.envs.fast.bodies import BODIES
+from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.fast.wrapped import AfterEnd, Wrapped, is_mujoco, make
 from prefrl.envs.partial import Partial
@@ -25,12 +26,15 @@ from prefrl.types import Floats, Segment
 
 SECONDS = 1.5
 """Default length of a segment: long enough to be judged, short enough to be judged at a glance."""
-STEPS_PER_SECOND = {"Pendulum-v1": 20.0, "CartPole-v0": 50.0, "CartPole-v1": 50.0}
+STEPS_PER_SECOND = {"Pendulum-v1": 20.0, "CartPole-v0": 50.0, "CartPole-v1": 50.0, "Acrobot-v1": 5.0}
 """Where `render_fps` is not the rate of the simulation, or is better not asked for."""
 WORLDS: dict[str, Callable[[bool], Dynamics]] = {
     "Pendulum-v1": lambda terminate: Pendulum(),
     "CartPole-v0": CartPole,
     "CartPole-v1": CartPole,
+    "Acrobot-v1": Acrobot,
+    "MountainCar-v0": MountainCar,
+    "MountainCarContinuous-v0": MountainCarContinuous,
 }
 """Environments whose equations are here, by whether episodes may end early."""
 
@@ -194,24 +198,21 @@ class GymnasiumTask:
 
 def _environments(name: str, single: Make, horizon: int, after: AfterEnd, count: int) -> Environments:
     """The fastest stepper there is for an environment."""
+    if after == "restart":  # the others know no fresh start within an episode
+        return Wrapped(single, count, horizon, after)
     if name in WORLDS:
         return Vectorised(WORLDS[name](after == "end"), count, horizon)
-    if name in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"):
-        from prefrl.envs.fast.locomotion import Locomotion
+    if name in BODIES:
+        from prefrl.envs.fast.simulated import Simulated
 
-        return Locomotion(name, single, count, horizon, after != "end")
+        return Simulated(name, single, count, horizon, after != "end")
     return Wrapped(single, count, horizon, after)
 
 
 def _partial(
-    environments: Callable[[int], Environments],
-    size: int,
-    hide: tuple[int, ...],
-    flicker: float,
-    stack: int,
-    count: int,
+    make: Callable[[int], Environments], size: int, hide: tuple[int, ...], flicker: float, stack: int, count: int
 ) -> Environments:
-    return Partial(environments(count), size, hide, flicker, stack)
+    return Partial(make(count), size, hide, flicker, stack)
 
 
 def _keywords(env: type) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from prefrl.types import Floats
@@ -28,6 +30,44 @@ def cartpole(state: Floats, size: int) -> Floats:
     return picture
 
 
+def acrobot(state: Floats, size: int) -> Floats:
+    """(size, size, 3): two links that hang at 0, and the line that the free end is to rise above."""
+    first, second = state[0], state[0] + state[1]
+    elbow = 0.65 * np.sin(first), -0.65 * np.cos(first)
+    end = elbow[0] + 0.65 * np.sin(second), elbow[1] - 0.65 * np.cos(second)
+    picture = np.full((size, size, 3), 255.0, np.float32)
+    stroke(picture, (-1.4, 0.65), (1.4, 0.65), 0.012, INK)
+    stroke(picture, (0.0, 0.0), elbow, 0.07, BLUE)
+    stroke(picture, elbow, end, 0.07, RED)
+    for joint in ((0.0, 0.0), elbow):
+        stroke(picture, joint, joint, 0.035, INK)
+    return picture
+
+
+def mountain_car(state: Floats, size: int, goal: float) -> Floats:
+    """(size, size, 3): a car in a valley from -1.2 to 0.6, and a flag at the goal, near the top."""
+    picture = np.full((size, size, 3), 255.0, np.float32)
+    ground = [_hill(x) for x in np.linspace(-1.2, 0.6, 25)]
+    for begin, end in pairwise(ground):
+        stroke(picture, begin, end, 0.012, INK)
+    foot = _hill(goal)
+    stroke(picture, foot, (foot[0], foot[1] + 0.35), 0.012, INK)
+    stroke(picture, (foot[0] + 0.04, foot[1] + 0.31), (foot[0] + 0.12, foot[1] + 0.31), 0.035, BLUE)
+    (x, y), tilt = _hill(state[0]), np.arctan(1.35 * np.cos(3 * state[0]))
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    back, front = ((x + a * cos - 0.06 * sin, y + a * sin + 0.06 * cos) for a in (-0.08, 0.08))
+    raised = -0.07 * sin, 0.07 * cos
+    stroke(picture, (back[0] + raised[0], back[1] + raised[1]), (front[0] + raised[0], front[1] + raised[1]), 0.06, RED)
+    for wheel in (back, front):
+        stroke(picture, wheel, wheel, 0.045, INK)
+    return picture
+
+
+def _hill(x: float) -> tuple[float, float]:
+    """Where the ground of the mountain car's valley is on the picture."""
+    return 1.5 * (x + 0.3), 0.675 * float(np.sin(3 * x))
+
+
 def finished(picture: Floats) -> np.ndarray:
     """uint8."""
     return np.rint(picture).astype(np.uint8)
@@ -41,9 +81,10 @@ def stroke(picture: Floats, begin: tuple[float, float], end: tuple[float, float]
     across = (np.arange(size, dtype=np.float32) + 0.5) * pixel - 1.5
     dx, dy = across[None, columns] - begin[0], -across[rows, None] - begin[1]
     along = end[0] - begin[0], end[1] - begin[1]
+    # The nearest point of the line, as a share of its length; the maximum is for a dot, which has none.
     share = np.clip((dx * along[0] + dy * along[1]) / max(along[0] ** 2 + along[1] ** 2, 1e-12), 0.0, 1.0)
     distance = np.hypot(dx - share * along[0], dy - share * along[1])
-    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]
+    cover = np.clip((radius - distance) / pixel + 0.5, 0.0, 1.0)[..., None]  # the edge fades over one pixel
     picture[rows, columns] += cover * (ink - picture[rows, columns])
 
 

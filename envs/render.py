@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from prefrl.envs.fast.wrapped import make
-from prefrl.envs.pictures import BLUE, cartpole, finished, pendulum, stroke
+from prefrl.envs.pictures import BLUE, acrobot, cartpole, finished, mountain_car, pendulum, stroke
 from prefrl.types import Floats, Segment
 
 INSTALL = "apt-get install -y libegl1 libgl1-mesa-dri"
@@ -26,10 +26,10 @@ def frames(name: str, segment: Segment, size: int) -> np.ndarray:
     """
     if segment.states is None:
         raise ValueError(
-            f"{name} cannot be drawn: its simulator gives no states to draw from; Pendulum, CartPole and MuJoCo "
+            f"{name} cannot be drawn: its simulator gives no states to draw from; classic control and MuJoCo "
             "environments can be"
         )
-    draw = {"Pendulum": _pendulum, "CartPole": _cartpole}.get(name.split("-")[0])
+    draw = _CLASSIC.get(name.split("-")[0])
     if draw is None:
         return _mujoco(name, segment.states, size)
     steps = zip(segment.states, segment.actions, strict=True)
@@ -43,9 +43,19 @@ def _pendulum(state: Floats, action: Floats, size: int) -> Floats:
     return picture
 
 
-def _cartpole(state: Floats, action: Floats, size: int) -> Floats:
-    # The nearest point of the line, as a share of its length; the maximum is for a dot, which has none.
-    return cartpole(state, size)  # the edge fades over one pixel
+def _still(draw: Callable[[Floats, int], Floats], state: Floats, action: Floats, size: int) -> Floats:
+    """A picture that shows nothing of the action."""
+    return draw(state, size)
+
+
+_CLASSIC: dict[str, Callable[[Floats, Floats, int], Floats]] = {
+    "Pendulum": _pendulum,
+    "CartPole": partial(_still, cartpole),
+    "Acrobot": partial(_still, acrobot),
+    "MountainCar": partial(_still, partial(mountain_car, goal=0.5)),
+    "MountainCarContinuous": partial(_still, partial(mountain_car, goal=0.45)),
+}
+"""By what gymnasium's id begins with."""
 
 
 # --- MuJoCo -------------------------------------------------------------------------------------------------------
@@ -84,12 +94,14 @@ def _model(name: str, size: int) -> Any:
 
 
 def _camera(env: Any) -> Any:
-    """The environment's usual camera, which follows the body."""
+    """The environment's usual camera, which follows the body; without one, gymnasium's, from above the middle."""
     import mujoco
 
     camera = mujoco.MjvCamera()
     camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FREE, -1
-    camera.lookat[:] = env.model.stat.center
+    mujoco.mj_forward(env.model, env.data)
+    # Not the model's centre, which a floor far below draws down until the body is out of the picture.
+    camera.lookat[:] = np.median(env.data.geom_xpos, axis=0)
     camera.distance = env.model.stat.extent
     named = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
     if named >= 0:

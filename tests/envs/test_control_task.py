@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from prefrl.components import ConfigError
-from prefrl.envs.control import ControlSettings
+from prefrl.envs.control import WORLDS, ControlSettings
+from prefrl.envs.fast.bodies import BODIES
 
 
 def test_seconds_become_steps_by_the_rate_of_the_simulation() -> None:
     assert ControlSettings(env="Pendulum-v1", segment_seconds=1.5).build().segment_steps == 30
     assert ControlSettings(env="CartPole-v1", segment_seconds=0.5).build().segment_steps == 25
+    assert ControlSettings(env="Acrobot-v1", segment_seconds=2.0).build().segment_steps == 10
+    assert ControlSettings(env="MountainCar-v0", segment_seconds=1.0).build().segment_steps == 30
     hopper = ControlSettings(env="Hopper-v5", segment_seconds=1.0).build()
     assert hopper.segment_steps == 125
     assert hopper.fps == pytest.approx(125.0)
@@ -48,7 +51,7 @@ def test_an_id_cannot_name_code_to_import() -> None:
         ControlSettings(env="antigravity:Pendulum-v1").build()
 
 
-@pytest.mark.parametrize("name", ["CartPole-v1", "Hopper-v5", "Walker2d-v5"])
+@pytest.mark.parametrize("name", [name for name in [*WORLDS, *BODIES] if name != "CartPole-v0"])
 def test_episodes_have_a_fixed_horizon_where_the_environment_allows_it(name: str) -> None:
     task = ControlSettings(env=name, horizon=60, segment_steps=5).build()
     envs = task.environments(2)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from prefrl.envs.control import ControlSettings, GymnasiumTask
+from prefrl.envs.fast.bodies import BODIES
 from prefrl.envs.render import graphics
 from prefrl.types import Floats, Segment
 
@@ -53,6 +54,23 @@ def test_a_cartpole_leans_to_the_right_at_positive_angles_and_moves_with_its_car
     assert moved[1] > 0.3
 
 
+def test_an_acrobot_hangs_at_0_and_bends_to_the_right_at_positive_angles() -> None:
+    task = _task("Acrobot-v1")
+    hanging, bent, up = task.frames(_segment(task, np.array([[0.0] * 4, [0.0, 1.0, 0, 0], [np.pi, 0.0, 0, 0]])))
+    assert _centre(hanging)[0] > 0.3
+    assert _centre(bent)[1] > 0.05
+    assert _centre(up)[0] < -0.3
+
+
+@pytest.mark.parametrize("env", ["MountainCar-v0", "MountainCarContinuous-v0"])
+def test_a_mountain_car_rises_on_both_sides_of_its_valley(env: str) -> None:
+    task = _task(env)
+    left, lowest, right = map(_centre, task.frames(_segment(task, np.array([[-1.1, 0], [-np.pi / 6, 0], [0.5, 0]]))))
+    assert left[1] < lowest[1] < right[1]
+    assert left[0] < lowest[0]
+    assert right[0] < left[0]
+
+
 def test_any_size_can_be_drawn() -> None:
     for size in (16, 101):
         task = _task("Pendulum-v1", size)
@@ -60,8 +78,8 @@ def test_any_size_can_be_drawn() -> None:
 
 
 def test_a_segment_without_states_says_what_can_be_drawn() -> None:
-    task = _task("MountainCarContinuous-v0")
-    one = Segment(np.zeros((3, 2), np.float32), np.zeros((3, 1), np.float32), "e", 0)
+    task = _task("Pendulum-v1")
+    one = Segment(np.zeros((3, 3), np.float32), np.zeros((3, 1), np.float32), "e", 0)
     with pytest.raises(ValueError, match="gives no states"):
         task.frames(one)
 
@@ -90,6 +108,22 @@ def test_another_state_gives_another_picture() -> None:
     assert states is not None
     first, second = task.frames(_segment(task, states))
     assert not np.array_equal(first, second)
+
+
+@needs_graphics
+@pytest.mark.parametrize("name", sorted(set(BODIES) - {"HalfCheetah-v5", "Hopper-v5"}))
+def test_each_body_is_in_its_picture(name: str) -> None:
+    """A body moved by a tenth changes the picture's middle, and not its edges alone."""
+    task = _task(name)
+    envs = task.environments(1)
+    envs.reset(np.random.default_rng(0))
+    states = envs.states()
+    assert states is not None
+    moved = states.copy()
+    moved[0, 1] += 0.1
+    one, other = task.frames(_segment(task, np.concatenate([states, moved])))
+    assert one.std() > 5
+    assert (one != other)[8:-8, 8:-8].any()
 
 
 @needs_graphics

@@ -6,8 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from prefrl.envs.fast.classic import CartPole, Pendulum
+from prefrl.envs.control import WORLDS
+from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
+from prefrl.protocols import Dynamics
 
 
 def _reference(name: str, states: np.ndarray) -> list[Any]:
@@ -50,6 +52,82 @@ def test_cartpole_equals_gymnasium_to_the_bit_until_it_falls(terminate: bool) ->
             assert step.rewards[i] == (reward if terminate else 1.0 - terminated)
             alive[i] = not terminated
     assert not alive.any()
+
+
+def _swing(name: str, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Actions that mostly push the way that a state moves, and so gain height."""
+    spin = states[:, 3] if name == "Acrobot-v1" else states[:, 1]
+    wish = np.where(rng.random(len(states)) < 0.3, rng.uniform(-1, 1, len(states)), np.where(spin >= 0, 1.0, -1.0))
+    if name == "MountainCarContinuous-v0":
+        return wish[:, None].astype(np.float32)
+    chosen: np.ndarray = np.eye(3, dtype=np.float32)[np.rint(wish).astype(int) + 1]
+    return chosen
+
+
+@pytest.mark.parametrize("terminate", [False, True])
+@pytest.mark.parametrize("name", ["Acrobot-v1", "MountainCar-v0", "MountainCarContinuous-v0"])
+def test_what_swings_up_equals_gymnasium_to_the_bit_until_it_is_there(name: str, terminate: bool) -> None:
+    rng = np.random.default_rng(2)
+    ours = Vectorised(WORLDS[name](terminate), 12, 400)
+    ours.reset(rng)
+    reference = _reference(name, ours.states().astype(np.float32 if name == "Acrobot-v1" else np.float64))
+    underway = np.ones(12, bool)
+    for _ in range(390):
+        before = ours.states().copy()
+        actions = _swing(name, before, rng)
+        step = ours.step(actions)
+        for i in np.flatnonzero(underway):
+            action = actions[i] if actions.shape[1] == 1 else int(actions[i].argmax())
+            observation, reward, there, *_ = reference[i].step(action)
+            assert np.array_equal(step.final_observations[i], observation)
+            assert step.rewards[i] == reward
+            assert step.terminated[i] == (there and terminate)
+            underway[i] = not there
+            assert step.terminated[i] or np.array_equal(ours.states()[i], reference[i].state)
+        if not terminate:
+            there = ~underway & (before == ours.states()).all(1)
+            assert (step.rewards[there] == 0).all()
+    assert not underway.any()
+
+
+@pytest.mark.parametrize(
+    ("world", "goal", "reward"),
+    [
+        (Acrobot(), [np.pi, 0.0, 0.0, 0.0], 0.0),
+        (MountainCar(), [0.49, 0.05], -1.0),
+        (MountainCarContinuous(), [0.44, 0.05], 100.0),
+    ],
+)
+def test_what_has_reached_its_goal_stays_there_and_pays_no_more(
+    world: Dynamics, goal: list[float], reward: float
+) -> None:
+    state, rng = np.array([goal]), np.random.default_rng(0)
+    size = 1 if isinstance(world, MountainCarContinuous) else 3
+    rest, push = np.eye(size, dtype=np.float32)[[size // 2]] * (size > 1), np.ones((1, size), np.float32)
+    there, first, terminated = world.advance(state, rest, rng)
+    still, later, _ = world.advance(there, push, rng)
+    assert (first[0], later[0], terminated[0]) == (reward, 0.0, False)
+    assert np.array_equal(still, there)
+
+
+def test_first_states_are_drawn_where_gymnasium_draws_them() -> None:
+    for world, low, high in (
+        (Acrobot(), -0.1, 0.1),
+        (MountainCar(), -0.6, -0.4),
+        (MountainCarContinuous(), -0.6, -0.4),
+    ):
+        states = world.start(200, np.random.default_rng(0))
+        drawn = states if states.shape[1] == 4 else states[:, 0]
+        assert low <= drawn.min() < low + 0.01
+        assert high - 0.01 < drawn.max() <= high
+        assert states.shape[1] == 4 or not states[:, 1].any()
+
+
+def test_an_acrobots_first_observation_is_gymnasiums_to_rounding() -> None:
+    states = Acrobot().start(50, np.random.default_rng(0))
+    reference = _reference("Acrobot-v1", states.astype(np.float32))
+    theirs = np.stack([env._get_ob() for env in reference])
+    np.testing.assert_allclose(Acrobot().observe(states), theirs, rtol=0, atol=1e-7)
 
 
 def test_an_ended_episode_is_reset_in_the_same_step_and_its_last_observation_kept() -> None:

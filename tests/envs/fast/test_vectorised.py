@@ -7,7 +7,7 @@ import pytest
 from corridor import LEFT, RIGHT, STAY, Corridor
 
 from prefrl.envs.control import WORLDS, ControlSettings
-from prefrl.envs.fast.classic import CartPole, Pendulum
+from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.toys import INK, Point, PointSettings
 from prefrl.protocols import Dynamics
@@ -16,6 +16,9 @@ from prefrl.types import Segment
 EVERY: dict[str, tuple[Dynamics, int]] = {
     "pendulum": (Pendulum(), 1),
     "cartpole": (CartPole(terminate=True), 2),
+    "acrobot": (Acrobot(terminate=True), 3),
+    "mountain car": (MountainCar(), 3),
+    "continuous mountain car": (MountainCarContinuous(), 1),
     "point": (Point(), 2),
     "corridor": (Corridor(), 3),
 }
@@ -85,7 +88,7 @@ def test_a_world_changes_nothing_that_it_is_given_and_repeats_itself(name: str) 
     np.testing.assert_array_equal(states, kept)
 
 
-@pytest.mark.parametrize("name", ["pendulum", "cartpole", "point"])
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "corridor"])
 def test_a_world_draws_its_states(name: str) -> None:
     world, _ = EVERY[name]
     one, other = (world.picture(state, 32) for state in world.start(2, np.random.default_rng(0)))
@@ -111,5 +114,7 @@ def test_the_frames_of_a_task_are_its_worlds_pictures() -> None:
 
 
 def test_the_table_of_worlds_knows_whether_episodes_may_end_early() -> None:
-    assert sorted(WORLDS) == ["CartPole-v0", "CartPole-v1", "Pendulum-v1"]
-    assert [WORLDS["CartPole-v1"](early) for early in (True, False)] == [CartPole(True), CartPole(False)]
+    cars = ["MountainCar-v0", "MountainCarContinuous-v0"]
+    assert sorted(WORLDS) == ["Acrobot-v1", "CartPole-v0", "CartPole-v1", *cars, "Pendulum-v1"]
+    for name, world in {"CartPole-v1": CartPole, "Acrobot-v1": Acrobot, "MountainCar-v0": MountainCar}.items():
+        assert [WORLDS[name](early) for early in (True, False)] == [world(True), world(False)]
