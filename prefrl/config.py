@@ -28,6 +28,7 @@ from prefrl.protocols import (
     SelectorSettings,
     Task,
     TaskSettings,
+    Threaded,
 )
 from prefrl.seeding import device_of, streams
 from prefrl.types import Json
@@ -130,6 +131,7 @@ class Config(Settings):
             fitting=self.fitting,
             settings=self.loop,
             seed=self.seed,
+            threads=self.learner.threads if isinstance(self.learner, Threaded) else None,
         )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

@@ -17,7 +17,7 @@ from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
 from prefrl.protocols import Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
-from prefrl.seeding import Streams, streams
+from prefrl.seeding import Streams, streams, threads
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
 
@@ -70,6 +70,8 @@ class Loop(Generic[C]):
     fitting: FittingSettings
     settings: LoopSettings
     seed: int = 0
+    threads: int | None = None
+    """With how many threads torch and BLAS compute; None leaves that to them."""
     round: int = -1
     """The last round that is done; 0 is the evaluation of the starting policy, -1 is nothing yet."""
     sequence: int = 0
@@ -83,7 +85,9 @@ class Loop(Generic[C]):
     def run(self) -> Iterator[Round[C]]:
         """Go on from where the loop stands to the last round."""
         while self.round < self.settings.rounds:
-            yield self.step() if self.round >= 0 else self.start()
+            with threads(self.threads):
+                done = self.step() if self.round >= 0 else self.start()
+            yield done
 
     def start(self) -> Round[C]:
         """Round 0: how good is the starting policy?"""

@@ -443,6 +443,14 @@ class LearnerSettings(Protocol):
 
 
 @runtime_checkable
+class Threaded(Protocol):
+    """Settings of a learner that say with how many threads a run computes."""
+
+    @property
+    def threads(self) -> int | None: ...
+
+
+@runtime_checkable
 class Settles(Protocol[C]):
     """A learner that goes back to its best policy where a round lost too much."""
 

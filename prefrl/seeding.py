@@ -8,6 +8,8 @@ starting weights and the same draws on every device.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -72,6 +74,27 @@ def device_of(name: Device) -> torch.device:
             "learner.device=cuda, but torch finds no GPU: set it to auto or cpu, or install a torch with CUDA"
         )
     return torch.device(("cuda" if found else "cpu") if name == "auto" else name)
+
+
+@contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """Let torch and BLAS compute with so many threads meanwhile; None leaves them as they are.
+
+    Between the products of small networks several threads only wait for one another, and they wait by spinning.
+    """
+    if count is None:
+        yield
+        return
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with threadpool_limits(count):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def to_host(value: torch.Tensor) -> torch.Tensor:

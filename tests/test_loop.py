@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from runs import tiny
+from threadpoolctl import threadpool_info
 
 from prefrl import Config
 from prefrl.config import presets
@@ -275,3 +276,24 @@ def test_a_warning_is_said_once(tmp_path: Path) -> None:
     loop._fit = lambda rng, pool: None  # type: ignore[method-assign]
     notes = [[note for note in round.notes if "is it constant?" in note] for round in loop.run()]
     assert [len(found) for found in notes] == [0, 1, 0]
+
+
+@pytest.mark.parametrize(("setting", "expected"), [("1", 1), ("2", 2), ("null", None)])
+def test_a_run_of_control_computes_with_the_threads_of_its_settings(
+    setting: str, expected: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, seen = torch.get_num_threads(), []
+    loop = build("control/toy", tmp_path, f"learner.threads={setting}", "loop.rounds=1")
+    evaluate = loop.learner.evaluate
+
+    def watched(*args: Any) -> Any:
+        blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+        seen.append((torch.get_num_threads(), *blas))
+        return evaluate(*args)
+
+    monkeypatch.setattr(loop.learner, "evaluate", watched)
+    list(loop.run())
+    assert torch.get_num_threads() == before
+    if expected is not None:
+        assert len(seen) == 2
+        assert {number for numbers in seen for number in numbers} == {expected}

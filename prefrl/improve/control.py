@@ -87,6 +87,8 @@ class ControlLearnerSettings(Settings):
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
+    threads: int | None = Field(1, ge=1)
+    """With how many threads torch and BLAS compute: more make small networks slower; null leaves it to them."""
 
     @model_validator(mode="before")
     @classmethod

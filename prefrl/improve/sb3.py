@@ -83,6 +83,8 @@ class SB3Settings(Settings):
     """Episodes of an evaluation, without exploration, in environments of their own."""
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
+    threads: int | None = Field(1, ge=1)
+    """With how many threads torch and BLAS compute: more make small networks slower; null leaves it to them."""
 
     def shrunk(self) -> SB3Settings:
         """One rollout of a batch in each environment; with a replay buffer about as many, learning from the first."""

@@ -30,7 +30,7 @@ from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
 
 from prefrl.components import Settings
 from prefrl.policies.pretrained import load_weights, quiet
-from prefrl.seeding import draw_seed
+from prefrl.seeding import draw_seed, threads
 from prefrl.storage.files import DamagedError, verify, whole_folder
 from prefrl.types import Fields
 
@@ -146,23 +146,12 @@ def clone(settings: CloningSettings, write: Writer) -> tuple[LlamaForCausalLM, P
         model.parameters(), settings.learning_rate, betas=(0.9, 0.98), weight_decay=0.01, fused=True
     )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step, len(batches)))
-    with progress(len(batches), Console(stderr=True)) as report, _one_thread():
+    with progress(len(batches), Console(stderr=True)) as report, threads(1):
         for batch in batches:
             report.advance(_step(model, optimizer, batch))
             schedule.step()
     model.eval()  # type: ignore[no-untyped-call]
     return model, tokenizer
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """For models this small several threads only wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def make_tokenizer(texts: list[str], vocabulary: int) -> PreTrainedTokenizerFast:
