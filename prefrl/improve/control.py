@@ -39,6 +39,10 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 """Where their defaults are others than those of the fields below."""
 
 
+SLOWER = 0.3
+"""What is left of the learning rate when a round was undone."""
+
+
 class ControlLearnerSettings(Settings):
     """Our own policy gradients on the learned reward: PPO by default, A2C or REINFORCE with a learned baseline."""
 
@@ -191,8 +195,11 @@ class ControlLearner:
         if self._settings.rollback is None:
             return None
         weights = {"policy": self.policy.state(), "optimizer": deepcopy(self._optimizer.state_dict())}
-        undone = self._player.settle(weights, reward, self._settings.rollback)
-        if undone is not None:
+        undone, best = self._player.settle(weights, reward, self._settings.rollback), self._player.best.weights
+        if undone is not None and best is not None:
+            # From here the same steps might lead to the same loss; the next try, and each one after it, is slower.
+            for group in best["optimizer"]["param_groups"]:
+                group["lr"] *= SLOWER
             self.go_back()
         return undone
 
@@ -266,6 +273,7 @@ class ControlLearner:
             steer(self._optimizer, kl / left**2, settings.target_kl, settings.learning_rate)
         means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
         # The first step's, where nothing has changed yet: anything but rounding is a bug.
+        means["learning_rate"] = left * self._optimizer.param_groups[0]["lr"]
         return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
 
     def _update(

@@ -19,6 +19,8 @@ from prefrl.protocols import ControlTask, PassByHand
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, State
 
+STEADY = 2.0
+"""By how much the scale of an input may change at once for the first layers to follow it."""
 CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations."""
 
@@ -175,22 +177,47 @@ class MLPPolicy:
     def observe(self, observations: Floats) -> None:
         """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979).
 
-        Never between acting and learning: the probability ratio would not start at 1.
+        The first layers change with it, so that what the policy does stays the same (as Pop-Art does for outputs, van
+        Hasselt et al. 2016): a mean that moved by a fifth of a standard deviation has ruined policies. The first time
+        they do not, when weights are random and are to see inputs of one size. Never between acting and learning: the
+        probability ratio would not start at 1.
         """
+        mean, scale = self.mean, self._scale
         # In float64: float32 sums lose small changes over many rounds.
         new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
         total = self.count + len(new)
         delta = new.mean(0) - self.mean
         squares = self.variance * self.count + new.var(0) * len(new) + delta**2 * self.count * len(new) / total
         self.mean = self.mean + delta * len(new) / total
-        self.variance, self.count = squares / total, total
+        known, self.variance, self.count = self.count > 0, squares / total, total
+        if known:
+            self._keep(mean, scale)
+
+    @property
+    def _scale(self) -> Floats:
+        found: Floats = 1.0 / np.sqrt(self.variance + 1e-8)  # eps: some inputs never change
+        return found
+
+    @torch.no_grad()
+    def _keep(self, mean: Floats, scale: Floats) -> None:
+        """Make the first layers do on inputs by the new statistics what they did by these (O,)."""
+        ratio, shift = scale / self._scale, (self.mean - mean) * scale
+        # An input that hardly changed before was blown up, and clipped: its weights are not to become as large.
+        steady = (ratio > 1 / STEADY) & (ratio < STEADY)
+        ratio, shift = (np.where(steady, x, plain) for x, plain in ((ratio, 1.0), (shift, 0.0)))
+        parts = self._parts(self._flat.data)
+        by, moved = (torch.from_numpy(x).to(self._flat) for x in (ratio, shift))
+        for net in ("actor", "critic"):
+            weight, bias = parts[f"{net}_0"], parts[f"{net}_1"]
+            bias += moved @ weight
+            weight *= by[:, None]
 
     def numpy_actor(self) -> NumpyActor:
         """What acts as the policy does now; it is not to be kept while the policy learns."""
         weights = self._views(self._flat)
         std = None if weights.log_std is None else np.exp(weights.log_std)
-        scale = 1.0 / np.sqrt(self.variance + 1e-8)  # eps: some inputs never change
-        return NumpyActor(self.space, weights.actor, std, self.mean.astype(np.float32), scale.astype(np.float32))
+        mean, scale = self.mean.astype(np.float32), self._scale.astype(np.float32)
+        return NumpyActor(self.space, weights.actor, std, mean, scale)
 
     def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""

@@ -52,10 +52,15 @@ def weights(learner: ControlLearner) -> bytes:
     return learner.policy.parameters()[0].detach().numpy().tobytes()
 
 
+def best_of(learner: ControlLearner) -> bytes:
+    learner.go_back()
+    return weights(learner)
+
+
 def test_a_policy_that_lost_clearly_goes_back_to_the_best_one() -> None:
     learner = built()
     assert turn(learner, NEAR, rounds=4) is None
-    good = weights(learner)
+    good = best_of(learner)
     moments = learner.state()["optimizer"]["state"][0]["exp_avg"].clone()
     ruin(learner)
     undone = turn(learner, NEAR, rounds=0)
@@ -67,6 +72,10 @@ def test_a_policy_that_lost_clearly_goes_back_to_the_best_one() -> None:
     assert undone.metrics["gold"] > undone.metrics["undone_gold"]
     assert undone.notes[0].startswith("round 4 was undone: by the newest reward its episodes are worth ")
     assert learner.steps.learn == 4 * 1600  # what was spent stays spent
+    rate = learner.state()["optimizer"]["param_groups"][0]["lr"]
+    ruin(learner)
+    turn(learner, NEAR, rounds=0)
+    assert learner.state()["optimizer"]["param_groups"][0]["lr"] == pytest.approx(0.3 * rate)
 
 
 def test_nothing_is_undone_by_chance_by_little_or_against_the_newest_reward() -> None:
@@ -99,7 +108,7 @@ def test_gold_has_no_say_in_it() -> None:
     object.__setattr__(task, "make", lambda n: Watched(Vectorised(Point(), n, 20), n, spent, hide=True))
     learner = ControlLearnerSettings.model_validate(SMALL).build(task, np.random.default_rng(2))
     turn(learner, NEAR, rounds=4)
-    good = weights(learner)
+    good = best_of(learner)
     ruin(learner)
     assert turn(learner, NEAR, rounds=0) is not None
     assert weights(learner) == good
@@ -108,7 +117,7 @@ def test_gold_has_no_say_in_it() -> None:
 def test_a_saved_learner_still_knows_its_best_policy(tmp_path: Path) -> None:
     learner = built()
     turn(learner, NEAR, rounds=4)
-    good = weights(learner)
+    good = best_of(learner)
     ruin(learner)
     save_state(tmp_path, "learner", learner.state())
     other = built()

@@ -75,6 +75,32 @@ def test_the_normaliser_has_the_mean_and_variance_of_all_it_observed() -> None:
     assert policy.normalise(np.full((1, 3), 1e6, np.float32)).tolist() == [[10.0] * 3]
 
 
+@pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
+def test_new_statistics_do_not_change_what_the_policy_does(env: str) -> None:
+    policy, rng = _policy(env), np.random.default_rng(5)
+    size = len(policy.mean)
+    observations = rng.normal(1, 2, (50, size)).astype(np.float32)
+
+    def done() -> tuple[np.ndarray, np.ndarray]:
+        inputs = torch.from_numpy(policy.normalise(observations))
+        return policy._outputs("actor", inputs).detach().numpy(), policy.values_of(inputs).detach().numpy()
+
+    before, mean, variance = done(), policy.mean, policy.variance
+    policy.observe(rng.normal(3, 2, (40, size)))
+    assert np.abs(policy.mean - mean).min() > 0.5
+    assert np.abs(policy.variance - variance).min() > 0.1
+    for one, other in zip(before, done(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_an_input_that_begins_to_change_does_not_blow_weights_up() -> None:
+    policy = MLPPolicy(ControlSettings(env="Pendulum-v1").build(), (4,), 1.0, np.random.default_rng(0))
+    still = np.random.default_rng(1).normal(0, 1, (50, 3)) * [1.0, 1.0, 0.0]
+    policy.observe(still)
+    policy.observe(still + np.random.default_rng(2).normal(0, 1, (50, 3)) * [0.0, 0.0, 1.0])
+    assert policy.named()["actor_0"].abs().max() < 3.0
+
+
 def test_unbounded_actions_are_left_alone() -> None:
     space = ActionSpace(
         2, np.array([0, 1], np.float32), np.array([1, 3], np.float32), np.array([np.inf, 1], np.float32)
