@@ -27,6 +27,8 @@ REWARDS: dict[str, dict[str, Any]] = {
 }
 
 
+ROUNDING = 1e-4
+"""On the CPU small perceptrons are worked out by hand, elsewhere by torch: the last digits of a fit differ."""
 TASK = PointSettings(horizon=8).build()
 
 
@@ -88,10 +90,10 @@ def test_a_fit_stays_on_the_device_of_its_reward_model(kind: str, options: dict[
         return found.metrics, (*scored, rewards, found.predicted), model.state()
 
     here, there = both(fitted)
-    assert_same(there[1], here[1])
-    assert_same(there[0], here[0])
+    assert_same(there[1], here[1], ROUNDING)
+    assert_same(there[0], here[0], ROUNDING)
     assert {type(x) for x in there[2].values() if isinstance(x, torch.Tensor)} == {Far}
-    assert_same(values(there[2]), values(here[2]))
+    assert_same(values(there[2]), values(here[2]), ROUNDING)
 
 
 def learned(settings: Any, task: Any, model: Any) -> tuple[Any, Any]:
@@ -115,8 +117,8 @@ def test_a_control_learner_keeps_to_its_device_and_learns_the_same_there() -> No
         return learned(settings.model_copy(update={"device": device}), TASK, model)
 
     here, there = both(round_of)
-    assert_same(there[0], here[0])
-    assert_same(values(there[1]), values(here[1]))
+    assert_same(there[0], here[0], ROUNDING)
+    assert_same(values(there[1]), values(here[1]), ROUNDING)
     assert {type(p) for p in there[1]["policy"]["parameters"].values()} == {Far}
 
 
@@ -137,9 +139,9 @@ def test_a_checkpoint_is_loaded_onto_the_device(tmp_path: Path) -> None:
         (tmp_path / device).mkdir()
     here, there = both(saved)
     assert {type(x) for x in there.values() if isinstance(x, torch.Tensor)} == {Far}
-    assert_same(values(there), values(here))
-    first, second = ((tmp_path / name / "reward.safetensors").read_bytes() for name in ("cpu", ELSEWHERE.type))
-    assert first == second
+    assert_same(values(there), values(here), ROUNDING)
+    first, second = (values(load_state(tmp_path / name, "reward")) for name in ("cpu", ELSEWHERE.type))
+    assert_same(second, first, ROUNDING)
 
 
 def test_the_device_of_these_tests_refuses_tensors_of_the_cpu() -> None:

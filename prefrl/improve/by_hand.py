@@ -65,6 +65,7 @@ def losses(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], objecti
     critic = bool(objective.value) or not objective.policy
     logp, entropies, values, pull_back = policy.by_hand(columns, objective.policy, critic)
     seen: Metrics = {"loss": 0.0}
+    distances: Metrics = {}
     of_logp = of_values = None
     if logp is not None:
         ratios = np.minimum(np.maximum(logp - columns["logp"], -MAX_LOG_RATIO), MAX_LOG_RATIO)
@@ -72,7 +73,7 @@ def losses(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], objecti
         gain, of_logp = _gain_and_slope(logp, ratios, 1 + ahead, columns["advantages"], objective.clip)
         of_logp /= len(logp)
         seen["loss"] = seen["policy_loss"] = _mean(gain)
-        seen |= _distances(ratios, ahead, objective)
+        distances = _distances(ratios, ahead, objective)
     if values is not None:
         weight = objective.value if objective.policy else 1.0
         apart = values - columns["returns"]
@@ -83,7 +84,7 @@ def losses(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], objecti
         seen["entropy"] = _mean(entropies)
         seen["loss"] -= objective.entropy * seen["entropy"]
     pull_back(of_logp, -objective.entropy / len(columns["logp"]), of_values)
-    return seen
+    return seen | distances
 
 
 def _gain_and_slope(
