@@ -90,7 +90,7 @@ def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torc
 def adam_of(policy: Policy[I], learning_rate: float) -> torch.optim.Adam:
     """The same of all that a policy learns, by hand where its gradient is."""
     if isinstance(policy, ByHand) and policy.works_by_hand:
-        return by_hand.Adam(policy.parameters(), learning_rate, eps=1e-5)
+        return by_hand.Adam(policy.parameters(), learning_rate, eps=1e-5, fused=True)
     return adam(policy.parameters(), learning_rate)
 
 
