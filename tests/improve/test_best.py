@@ -156,7 +156,7 @@ class Ruined(ControlLearner):
 
 
 def test_a_run_says_what_was_undone_and_ends_with_the_policy_that_stands(tmp_path: Path) -> None:
-    config = Config.load("control/toy", ["loop.rounds=4"])
+    config = Config.load("control/toy", ["loop.rounds=4", "loop.labels=8"])
     with Store[Any](tmp_path) as store:
         loop: Loop[Any] = config.build(store)
         loop.reward = NEAR
