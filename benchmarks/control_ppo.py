@@ -6,7 +6,7 @@
 Both have 16 environments, rollouts of 256 steps in each, minibatches of 256, 10 epochs, two layers of 64 units, and the
 same learning rate, clip, discount and trace; stable-baselines3 steps with DummyVecEnv, which is its fastest here, and
 normalises observations and rewards (VecNormalize). Ours normalises observations itself, and is given the true reward at
-mean 0 and std 1, as a fitted reward model would be.
+mean 0 and std 1, as a fitted reward model would be. Episodes end where gymnasium ends them, for both.
 
 The first command measures speed: windows of learning take turns in one process, with one thread; what acting, stepping
 and updating cost together is compared in CPU seconds. `ratio` is peer / ours: above 1, prefrl needs fewer.
@@ -73,7 +73,7 @@ class Ours:
             critic_epochs=0,
             entropy=0.0,
         )
-        self._task = ControlSettings(env=env).build()
+        self._task = ControlSettings(env=env, variable_horizon=True).build()
         self._learner, self._rng = settings.build(self._task, np.random.default_rng(seed)), np.random.default_rng(seed)
         self._reward = TrueReward()
 

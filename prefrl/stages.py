@@ -279,9 +279,7 @@ def load_policy(folder: str | Path, best: bool = False) -> Loaded:
 
     Raises `RunError` for a run of text, and for the best one of a learner that keeps none.
     """
-    learner, task, _ = _learner_of(Path(folder), best)
-    if not isinstance(learner, Acts):
-        raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
+    learner, task, _ = _acting(Path(folder), best)
     return Loaded(learner.actor(), task.observation_size, task.action_bounds is None)
 
 
@@ -290,11 +288,16 @@ def export_sb3(folder: Path, to: Path, best: bool = False) -> int:
 
     Raises `RunError` as `load_policy` does.
     """
-    learner, _, round = _learner_of(folder, best)
-    if not isinstance(learner, Acts):
-        raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
+    learner, _, round = _acting(folder, best)
     learner.save(to)
     return round
+
+
+def _acting(folder: Path, best: bool) -> tuple[Acts, Any, int]:
+    learner, task, round = _learner_of(folder, best)
+    if not isinstance(learner, Acts):
+        raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
+    return learner, task, round
 
 
 def _learner_of(folder: Path, best: bool) -> tuple[Any, Any, int]:

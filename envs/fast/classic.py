@@ -169,7 +169,8 @@ class MountainCar:
     terminate: bool = False
 
     def start(self, count: int, rng: np.random.Generator) -> Floats:
-        return _in_the_valley(count, rng)
+        """At rest, near the lowest point."""
+        return np.stack([rng.uniform(-0.6, -0.4, count), np.zeros(count)], 1)
 
     def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         there = self._arrived(states)
@@ -196,17 +197,12 @@ class MountainCar:
 
 
 @dataclass(frozen=True)
-class MountainCarContinuous:
+class MountainCarContinuous(MountainCar):
     """gymnasium's MountainCarContinuous-v0: as MountainCar, with a force within [-1, 1] that costs its square.
 
     The step that reaches the goal earns 100. Without terminations (a fixed horizon) what has reached it stays there,
     and the reward is 0 from the next step on: the return is gymnasium's.
     """
-
-    terminate: bool = False
-
-    def start(self, count: int, rng: np.random.Generator) -> Floats:
-        return _in_the_valley(count, rng)
 
     def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
         there = self._arrived(states)
@@ -223,23 +219,12 @@ class MountainCarContinuous:
         rewards = np.where(there, 0.0, 100.0 * arrived - np.square(force.astype(np.float64)) * 0.1)
         return following, rewards, arrived & self.terminate
 
-    def observe(self, states: Floats) -> Floats:
-        return states.astype(np.float32)
-
-    def legal(self, states: Floats) -> Bools | None:
-        return None
-
     def picture(self, state: Floats, size: int) -> np.ndarray:
         return finished(mountain_car(state, size, goal=0.45))
 
     def _arrived(self, states: Floats) -> Bools:
         arrived: Bools = (states[:, 0] >= np.float32(0.45)) & (states[:, 1] >= 0)
         return arrived
-
-
-def _in_the_valley(count: int, rng: np.random.Generator) -> Floats:
-    """First states of both mountain cars: at rest, near the lowest point."""
-    return np.stack([rng.uniform(-0.6, -0.4, count), np.zeros(count)], 1)
 
 
 def _within(values: Floats, bound: float) -> Floats:

@@ -50,12 +50,16 @@ def _learning(record: Record) -> tuple[Card, ...]:
     gold, learned = record.series("evaluate/gold"), _learned(record)
     spread = record.series("evaluate/gold_std")
     band = spread if any(value is not None for value in spread) else ()
+    undone = record.series("evaluate/undone_gold")
+    rounds = [str(number) for number, value in zip(at, undone, strict=True) if value is not None]
+    curves = [Line(gold, "gold", "of the policy that stands" if rounds else "", spread=band)]
+    said = f" Undone, since the newest reward saw a clear loss: round {', '.join(rounds)}." if rounds else ""
     return (
         Card(
             "Gold, hidden from the learner",
-            plots.lines("gold", at, [Line(gold, "gold", spread=band)]),
+            plots.lines("gold", at, [*curves, *([Line(undone, "muted", "undone")] if rounds else [])]),
             "The task's own value of fresh behaviour, which nothing that learns may read: up is better. "
-            "The band is one standard deviation between episodes or responses.",
+            f"The band is one standard deviation between episodes or responses.{said}",
         ),
         Card(
             "Learned reward",
