@@ -88,9 +88,8 @@ def _with_plain_actions(make: Make) -> gymnasium.Env[Any, Any]:
 
     def taken_apart(choice: Any) -> np.ndarray:
         """One choice among all combinations -> a choice of each."""
-        found: np.ndarray = (np.array(np.unravel_index(int(choice), choices)).reshape(shape) + start).astype(
-            space.dtype
-        )
+        each = np.array(np.unravel_index(int(choice), choices)).reshape(shape)
+        found: np.ndarray = (each + start).astype(space.dtype)
         return found
 
     return TransformAction(env, taken_apart, Discrete(_combinations(space)))

@@ -136,6 +136,14 @@ def test_it_is_honest_when_the_policy_got_worse(tmp_path: Path) -> None:
     assert "it has been better than it ended" in found.text
 
 
+def test_rounds_that_were_undone_are_named_and_drawn(tmp_path: Path) -> None:
+    lines = [line(0), line(1), line(2, **{"evaluate/undone_gold": -300.0}), line(3, **{"evaluate/undone_gold": -200.0})]
+    found = page(run_folder(tmp_path / "run", lines, summary=summary()))
+    assert "Undone, since the newest reward saw a clear loss: round 2, 3." in found.text
+    assert "of the policy that stands" in found.text
+    assert "Undone" not in page(whole_run(tmp_path / "other")).text
+
+
 def test_without_gold_nothing_is_claimed(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/gold": float("nan"), "evaluate/gold_std": None}) for i in range(3)]
     missing = {"gold_before": None, "gold_after": None, "gold_best": None}
