@@ -184,7 +184,7 @@ class Loop(Generic[C]):
         notes = (*self._notes, *evaluated.notes, *self._warnings(number, metrics))
         self.sequence = self.store.sequence
         self.round, self._seconds, self._notes, self.stage = number, {}, [], "idle"
-        return Round(number, metrics, evaluated.examples, fitted, notes)
+        return Round(number, metrics, evaluated.examples, fitted, notes, evaluated.candidates)
 
     def _warnings(self, number: int, metrics: Metrics) -> list[str]:
         """What the round's numbers warn of, each thing once."""

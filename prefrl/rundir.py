@@ -17,6 +17,8 @@ from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
+from prefrl.evaluate.hindsight import FILE as HINDSIGHT
+from prefrl.evaluate.hindsight import hindsight, keep
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Noted, RewardModel, Task
@@ -99,8 +101,13 @@ class Run:
         return summarise(self._rows, self.loop.task, self.config.seed)
 
     def report(self) -> Path:
-        """Grade the reward model where judgements were held out, write `report.html`, and say where it is."""
+        """Grade the reward model where judgements were held out, score all rounds by it, and write `report.html`."""
         config, loop = self.config, self.loop
+        rng = streams(config.seed, 0).evaluate
+        fits = [row["round"] for row in self._rows if row.get("fit/loss") is not None]
+        found = hindsight(self.folder, loop.round, fits[-1] if fits else None, loop.reward, rng)
+        if found is not None:
+            write_file(self.folder / HINDSIGHT, found.model_dump_json(indent=1).encode())
         subject = of_run(loop.reward, self.store, self.folder, loop.round, config.fitting, config.discount)
         if subject is not None:
             card = grade(subject, streams(config.seed, 0).evaluate)
@@ -139,6 +146,8 @@ class Run:
         if round.fitted is not None:
             self._score_probes(round.number)
         self._save_examples(round)
+        if round.evaluated:
+            keep(self.folder, round.number, round.evaluated)
         for name, value in round.metrics.items():
             self._events.add_scalar(name, value, round.number)
         self._checkpoint(round.number)

@@ -166,6 +166,8 @@ class Evaluation(Generic[C]):
     examples: tuple[C, ...] = ()
     notes: tuple[str, ...] = ()
     """What a person should know."""
+    candidates: tuple[C, ...] = field(default=(), repr=False)
+    """All that was measured, whole, in an order in which all rounds begin alike: those of two rounds are pairs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +193,8 @@ class Round(Generic[C]):
     """This round's fit; None in round 0 and where there was nothing to fit on."""
     notes: tuple[str, ...] = ()
     """What did not go as asked, for people."""
+    evaluated: tuple[C, ...] = field(default=(), repr=False)
+    """As `Evaluation.candidates`."""
 
 
 def is_whole(value: Any, most: float = math.inf) -> bool:

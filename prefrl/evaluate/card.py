@@ -1,4 +1,5 @@
-"""What a report card of a reward model says: plain data, as it lies in `card.json`. What is not defined says why."""
+"""What a report card of a reward model says, and what it says of a run's rounds: plain data, as it lies in `card.json`
+and `hindsight.json`. What is not defined says why."""
 
 from __future__ import annotations
 
@@ -180,3 +181,21 @@ class ReportCard(Part):
     seconds: Estimate
     """To score 1000 candidates."""
     scatter: Scatter
+
+
+class Seen(Part):
+    """A round's evaluation by the newest reward."""
+
+    round: int
+    learned: Estimate
+    """Mean score of a candidate."""
+    won: Estimate
+    """Share of candidates that are worth more than what the start did in their place; equal ones count half."""
+
+
+class Hindsight(Part):
+    """The rounds so far, in order, all scored by one reward."""
+
+    fitted_round: int | None
+    """The round of its fit; None for a reward that the run began with."""
+    rounds: tuple[Seen, ...]

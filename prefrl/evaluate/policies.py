@@ -28,19 +28,21 @@ ORDERS = 4
 
 
 def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]) -> Evaluation[Segment]:
-    """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`; and openings to look at."""
+    """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`, and their `count`."""
     gold, learned, lengths = returns(rollout, reward)
     shown = max(1, round(EXAMPLE_SECONDS * task.fps))
     examples = [
         segment(rollout, i, 0, min(int(lengths[i]), shown), "evaluation") for i in range(min(EXAMPLES, len(gold)))
     ]
+    whole = tuple(segment(rollout, i, 0, int(length), "evaluation") for i, length in enumerate(lengths))
     metrics = {
+        "count": float(len(gold)),
         "gold": float(gold.mean()),
         "gold_std": float(gold.std()),
         "learned": float(learned.mean()),
         "length": float(lengths.mean()),
     }
-    return Evaluation(metrics, tuple(examples))
+    return Evaluation(metrics, tuple(examples), candidates=whole)
 
 
 class Returns(NamedTuple):
@@ -66,7 +68,7 @@ def responses(
 ) -> tuple[Evaluation[Response], int]:
     """One response at temperature 1 to each of so many evaluation prompts, and how many tokens that took.
 
-    Metrics: gold, gold_std, learned, kl (nats per response: the mean log-ratio to the starting policy), length
+    Metrics: count, gold, gold_std, learned, kl (nats per response: the mean log-ratio to the starting policy), length
     (tokens), ended (share), distinct_1, distinct_2, self_bleu, and fluency where the task can tell.
     """
     task = policy.task
@@ -74,6 +76,7 @@ def responses(
     found = policy.with_gold(drawn)
     gold, scores = np.array([r.gold for r in found], float), scored(reward, found)
     metrics = {
+        "count": float(len(found)),
         "gold": float(gold.mean()),
         "gold_std": float(gold.std()),
         "learned": _mean(scores),
@@ -88,7 +91,8 @@ def responses(
     metrics |= {"self_bleu": self_bleu(words)} if len(words) > 1 else {}
     fluent = task.fluency(found)
     metrics |= {} if fluent is None else {"fluency": float(fluent.mean())}
-    return Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES])), drawn.count
+    evaluation = Evaluation(metrics, tuple(found[:EXAMPLE_RESPONSES]), candidates=tuple(found))
+    return evaluation, drawn.count
 
 
 def scored(reward: RewardModel[Response], candidates: Sequence[Response]) -> Floats:

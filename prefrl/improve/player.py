@@ -61,7 +61,7 @@ class Player:
         )
         gold = float(returns(self._evaluated, reward).gold.mean())
         metrics = found.metrics | {"undone_learned": undone.after, "undone_gold": gold}
-        return Evaluation(metrics, found.examples, (note,))
+        return Evaluation(metrics, found.examples, (note,), found.candidates)
 
     def state(self) -> State:
         recent = None if self._recent is None else self._recent.state()

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
+from prefrl.evaluate.card import Hindsight
 from prefrl.evaluate.summary import STAGES
 from prefrl.report import plots
 from prefrl.report.facts import Facts
-from prefrl.report.plots import Line
+from prefrl.report.plots import Line, Series
 from prefrl.report.records import Record, whole
+from prefrl.stats.estimates import Estimate
+
+INTERVAL = 1.96
+"""Standard errors on each side of a mean."""
+TRAINING = {
+    "Entropy": ("improve/entropy", "How undecided the policy is, in nats a step: it falls as it makes up its mind."),
+    "Step size": (
+        "improve/kl_old",
+        "How far an update moves the policy, in nats: a jump is one that went wrong.",
+    ),
+    "Clipped": ("improve/clipped", "The share of steps whose probability ratio left the clip's range."),
+    "Critic": ("improve/explained", "The share of the returns' variance that the critic foresees: 1 is all, 0 none."),
+    "Loss": ("improve/loss", "What the gradient steps minimise: it need not fall for the policy to get better."),
+    "Learning rate": ("improve/learning_rate", "At the end of each round's updates, or on average."),
+    "Length": ("evaluate/length", "Of what the policy does, on average: a reward that pays for length shows here."),
+}
+"""Name -> the metric, and how to read it."""
 
 
 @dataclass(frozen=True)
@@ -32,48 +52,124 @@ class Chapter:
 
 
 def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
-    """All figures. Those of a text's drift are there only where the run measures it."""
-    drift = _drift(record) if facts.words.drifts or facts.kl is not None else ()
-    return (
-        Chapter("Did it help?", _learning(record) + drift),
-        Chapter("Was the reward model right?", _fitting(record)),
+    """All figures that the run can have: none of a text's drift where it measures none, none of gold where there is
+    none, and once it is over none that is empty."""
+    found = (
+        Chapter("Did it help?", (*_learning(record, facts), *_drift(record, facts))),
+        Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
+        Chapter("How did it learn?", _training(record)),
         Chapter("What did it cost?", _cost(record, facts)),
     )
+    if facts.finished:
+        found = tuple(replace(c, cards=tuple(card for card in c.cards if card.figure)) for c in found)
+    return tuple(chapter for chapter in found if chapter.cards)
 
 
 def _numbers(record: Record) -> list[int]:
     return [whole(line["round"]) or 0 for line in record.rounds]
 
 
-def _learning(record: Record) -> tuple[Card, ...]:
-    at = _numbers(record)
-    gold, learned = record.series("evaluate/gold"), _learned(record)
-    spread = record.series("evaluate/gold_std")
-    band = spread if any(value is not None for value in spread) else ()
+def _known(values: Series) -> bool:
+    return any(value is not None for value in values)
+
+
+def _learning(record: Record, facts: Facts) -> tuple[Card, ...]:
+    gold = (_gold(record),) if _known(record.series("evaluate/gold")) or not facts.finished else ()
+    if record.hindsight is None:
+        return (*gold, _learned_then(record, facts))
+    agreement = (_agreement(record),) if gold else ()
+    return (*gold, *_by_newest(record.hindsight, facts), *agreement)
+
+
+def _gold(record: Record) -> Card:
+    at, gold, spread = _numbers(record), record.series("evaluate/gold"), record.series("evaluate/gold_std")
+    counts = record.series("evaluate/count")
+    means = _known(counts)  # runs of before did not count
+    width = [
+        None if g is None or s is None else INTERVAL * s / math.sqrt(n) if n else s
+        for g, s, n in zip(gold, spread, counts, strict=True)
+    ]
+    edges = [
+        [None if g is None or w is None else g + sign * w for g, w in zip(gold, width, strict=True)] for sign in (-1, 1)
+    ]
     undone = record.series("evaluate/undone_gold")
     rounds = [str(number) for number, value in zip(at, undone, strict=True) if value is not None]
-    curves = [Line(gold, "gold", "of the policy that stands" if rounds else "", spread=band)]
+    low, high = edges if _known(width) else ((), ())
+    curves = [Line(gold, "gold", "of the policy that stands" if rounds else "", low=low, high=high)]
     said = f" Undone, since the newest reward saw a clear loss: round {', '.join(rounds)}." if rounds else ""
+    band = "95 % interval of the mean" if means else "standard deviation between episodes or responses"
+    return Card(
+        "Gold, hidden from the learner",
+        plots.lines("gold", at, [*curves, *([Line(undone, "muted", "undone")] if rounds else [])]),
+        "The task's own value of fresh behaviour, which nothing that learns may read: up is better. "
+        f"The band is the {band}.{said}",
+    )
+
+
+def _by_newest(found: Hindsight, facts: Facts) -> tuple[Card, ...]:
+    at = [seen.round for seen in found.rounds]
+    who = "the reward that the run began with" if facts.fixed else f"the newest reward, of round {found.fitted_round}"
+    behaviour = facts.words.behaviour
+
+    def line(estimates: Sequence[Estimate]) -> Line:
+        return Line(
+            [e.value for e in estimates], "learned", low=[e.low for e in estimates], high=[e.high for e in estimates]
+        )
+
     return (
         Card(
-            "Gold, hidden from the learner",
-            plots.lines("gold", at, [*curves, *([Line(undone, "muted", "undone")] if rounds else [])]),
-            "The task's own value of fresh behaviour, which nothing that learns may read: up is better. "
-            f"The band is one standard deviation between episodes or responses.{said}",
-        ),
-        Card(
             "Learned reward",
-            plots.lines("learned", at, [Line(learned, "learned", dash="--")]),
-            "What the policy was trained on. It has no absolute scale and is fitted anew each round: "
-            "it may fall while the policy gets better. Do not compare its values with gold, or between rounds.",
+            plots.lines("learned", at, [line([seen.learned for seen in found.rounds])]),
+            f"What each round's {behaviour}s are worth by {who}: one reward for all rounds, so that they can be "
+            "compared. The policy was trained on it, and may exploit its errors. The band is the 95 % interval.",
         ),
         Card(
-            "Do the two agree?",
-            plots.path("agreement", learned, gold, ("learned reward", "gold")),
-            "One dot a round, joined in order. Up is progress. Right and down is the mark of a policy "
-            "that exploits errors of the reward model; left is a new fit that moved the scale.",
+            "Wins against the start",
+            plots.lines(
+                "won",
+                at[1:],
+                [line([seen.won for seen in found.rounds[1:]])],
+                percent=True,
+                zero=True,
+                beside=0.5,
+            ),
+            f"How often a round's {behaviour} is worth more, by {who}, than the starting policy's from the same "
+            f"{facts.words.start}. At the dashes the policy is no better than the start.",
         ),
     )
+
+
+def _learned_then(record: Record, facts: Facts) -> Card:
+    """What each round's reward said of its own policy."""
+    scale = (
+        "It is the reward that the run began with, the same in all rounds."
+        if facts.fixed
+        else "It has no absolute scale and is fitted anew each round: it may fall while the policy gets better. "
+        "Do not compare its values with gold, or between rounds."
+    )
+    return Card(
+        "Learned reward",
+        plots.lines("learned", _numbers(record), [Line(_learned(record), "learned", dash="--")]),
+        f"What the policy was trained on. {scale}",
+    )
+
+
+def _agreement(record: Record) -> Card:
+    learned = _in_hindsight(record)
+    return Card(
+        "Do the two agree?",
+        plots.path("agreement", learned, record.series("evaluate/gold"), ("learned reward", "gold")),
+        "One dot a round, joined in order. Up is progress. Right and down is the mark of a policy that exploits "
+        "errors of the reward model.",
+    )
+
+
+def _in_hindsight(record: Record) -> list[float | None]:
+    """The learned reward by round: by the newest reward where that was measured, else as each round's own said."""
+    if record.hindsight is None:
+        return _learned(record)
+    by_round = {seen.round: seen.learned.value for seen in record.hindsight.rounds}
+    return [by_round.get(number) for number in _numbers(record)]
 
 
 def _learned(record: Record) -> list[float | None]:
@@ -83,7 +179,9 @@ def _learned(record: Record) -> list[float | None]:
     return [value if i >= first else None for i, value in enumerate(record.series("evaluate/learned"))]
 
 
-def _drift(record: Record) -> tuple[Card, ...]:
+def _drift(record: Record, facts: Facts) -> tuple[Card, ...]:
+    if not facts.words.drifts and facts.kl is None:
+        return ()
     at = _numbers(record)
     kl, fluency, gold = (record.series(f"evaluate/{key}") for key in ("kl", "fluency", "gold"))
     return (
@@ -102,7 +200,28 @@ def _drift(record: Record) -> tuple[Card, ...]:
             plots.path("frontier", kl, gold, ("KL, nats per response", "gold")),
             "One dot a round. Where the curve bends down, more optimisation makes things worse.",
         ),
+        _gains(record, kl, gold),
     )
+
+
+def _gains(record: Record, kl: Series, gold: Series) -> Card:
+    curves = [
+        Line(_of_best_gain(gold), "gold", "gold"),
+        Line(_of_best_gain(_in_hindsight(record)), "learned", "learned reward", dash="--"),
+    ]
+    return Card(
+        "Over-optimisation",
+        plots.against("gains", kl, curves, ("KL, nats per response", "share of the best gain")),
+        "What was gained since the start, as a share of the most that either has gained. Gold that bends down while "
+        "the learned reward goes on rising is Goodhart's law at work: an earlier round is the better policy.",
+    )
+
+
+def _of_best_gain(values: Series) -> list[float | None]:
+    """From 0 at the first to 1 at the best; nothing where nothing was gained."""
+    known = [value for value in values if value is not None]
+    best = max(known) - known[0] if known else 0.0
+    return [None if value is None or not best else (value - known[0]) / best for value in values]
 
 
 def _fitting(record: Record) -> tuple[Card, ...]:
@@ -125,12 +244,26 @@ def _fitting(record: Record) -> tuple[Card, ...]:
             "Negative log-likelihood of a judgement in nats; a coin has 0.69. A held-out loss that rises while the "
             "training loss falls is overfitting.",
         ),
-        Card(
-            "Calibration",
-            plots.reliability("calibration", record.reliability),
-            "Of held-out comparisons that the model is so sure about, the share in which it was right, with 95 % "
-            "intervals; below the dashes it is too sure. Bars and numbers count the comparisons.",
-        ),
+        *(() if record.card else (_calibration(record),)),  # a card has one of its own
+    )
+
+
+def _calibration(record: Record) -> Card:
+    return Card(
+        "Calibration",
+        plots.reliability("calibration", record.reliability),
+        "Of held-out comparisons that the model is so sure about, the share in which it was right, with 95 % "
+        "intervals; below the dashes it is too sure. Bars and numbers count the comparisons.",
+    )
+
+
+def _training(record: Record) -> tuple[Card, ...]:
+    """What the learner says of itself, where it says it and it changes."""
+    found = {name: record.series(f"{TRAINING[name][0]}") for name in TRAINING}
+    return tuple(
+        Card(name, plots.lines(f"training-{i}", _numbers(record), [Line(found[name], "improve")]), reading)
+        for i, (name, (_, reading)) in enumerate(TRAINING.items())
+        if len({value for value in found[name] if value is not None}) > 1
     )
 
 

@@ -1,4 +1,4 @@
-"""A few candidates kept for the report: texts as they are, clips as strips of frames."""
+"""A few candidates kept for the report: texts as they are, clips as small films and as strips of frames."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ GAP, GREY = 2, 215
 """Between two frames: pixels, and a shade that is seen on white pictures and on black ones."""
 HEIGHT = 160
 """Pixels. Larger frames are made smaller, so that a report of many strips stays light."""
+RATE = 12.5
+"""Pictures of a film in a second, at most."""
 
 
 def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | None, folder: Path, name: str) -> Path:
-    """Write `examples/<name>.json` into a run's folder, with a PNG strip for each clip, and return its path.
+    """Write `examples/<name>.json` into a run's folder, with a film (WebP) and a strip (PNG) for each clip.
 
-    `learned` (N,) is the reward model's score of each example, None before there is a fitted one. Where frames
-    cannot be drawn (no graphics library, no simulator states) the caption says so.
+    Returns its path. `learned` (N,) is the reward model's score of each example, None before there is a fitted one.
+    Where frames cannot be drawn (no graphics library, no simulator states) the caption says so.
     """
     if learned is not None and len(learned) != len(examples):
         raise ValueError(f"expected one learned score for each of {len(examples)} examples, got {len(learned)}")
@@ -36,7 +38,7 @@ def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | N
     scores = [math.nan] * len(examples) if learned is None else [float(score) for score in learned]
     for i, (candidate, score) in enumerate(zip(examples, scores, strict=True)):
         gold = None if candidate.gold is None else _finite(gold_score(candidate))
-        shown = _show(task, candidate, place, f"{name}-{i}.png")
+        shown = _show(task, candidate, place, f"{name}-{i}")
         entries.append({"gold": gold, "learned": _finite(score), **shown})
     path = place / f"{name}.json"
     write_file(path, json.dumps(entries, indent=1, allow_nan=False).encode())
@@ -61,8 +63,9 @@ def _show(task: Task, candidate: Candidate, place: Path, file: str) -> Json:
         frames = drawn.frames(candidate)
     except Exception as error:  # a renderer may raise anything, and a missing picture must not end a run
         return {"caption": f"No picture: drawing failed with {type(error).__name__}: {error}"}
-    _save(strip(frames), place / file)
-    return {"strip": file, "caption": _caption(drawn, shown.steps)}
+    save_strip(strip(frames), place / f"{file}.png")
+    save_film(frames, drawn.fps, place / f"{file}.webp")
+    return {"strip": f"{file}.png", "film": f"{file}.webp", "caption": _caption(drawn, shown.steps)}
 
 
 def _caption(task: DrawnTask[Any], steps: int) -> str:
@@ -70,13 +73,29 @@ def _caption(task: DrawnTask[Any], steps: int) -> str:
     return f"{steps} steps, {seconds:.1f} s of simulated time, from left to right"
 
 
-def _save(picture: np.ndarray, path: Path) -> None:
-    image = Image.fromarray(picture)
-    if image.height > HEIGHT:
-        image = image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.LANCZOS)
+def save_strip(picture: np.ndarray, path: Path) -> None:
+    """Write a picture (H, W, 3) uint8 as a PNG."""
     buffer = io.BytesIO()
-    image.save(buffer, format="PNG", optimize=True)
+    _small(picture).save(buffer, format="PNG", optimize=True)
     write_file(path, buffer.getvalue())
+
+
+def save_film(frames: np.ndarray, fps: float, path: Path) -> None:
+    """Write frames (T, H, W, 3) uint8, so many of a second, as a WebP that plays over and over."""
+    step = max(1, math.ceil(fps / RATE))
+    first, *rest = (_small(frame) for frame in frames[::step])
+    buffer, seconds = io.BytesIO(), step / fps
+    first.save(
+        buffer, format="WEBP", save_all=True, append_images=rest, duration=round(1000 * seconds), loop=0, quality=60
+    )
+    write_file(path, buffer.getvalue())
+
+
+def _small(picture: np.ndarray) -> Image.Image:
+    image = Image.fromarray(picture)
+    if image.height <= HEIGHT:
+        return image
+    return image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.LANCZOS)
 
 
 def _finite(value: float) -> float | None:

@@ -9,6 +9,7 @@ from typing import Any
 from prefrl.evaluate.summary import STAGES
 from prefrl.kinds import RESPONSES, SEGMENTS, Kind, find
 from prefrl.report.records import Record, mapping, number, visible, whole
+from prefrl.stats.estimates import Estimate
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,12 @@ class Facts:
     """Before, after, best."""
     gold_spread: tuple[float | None, float | None]
     """Standard deviation between episodes or responses, before and after."""
+    measured: int | None
+    """Episodes or responses of an evaluation."""
+    won: Estimate | None
+    """How often the newest policy beats the start, by the newest reward; None where that was not measured."""
+    fixed: bool
+    """Whether the reward is one that the run began with, and never fitted."""
     fluency: tuple[float | None, float | None]
     reward_accuracy: float | None
     kl: float | None
@@ -70,6 +77,9 @@ def gather(record: Record) -> Facts:
             first("gold_best", max(known, default=None)),
         ),
         gold_spread=(spread[0], spread[-1]) if spread else (None, None),
+        measured=whole(record.last("evaluate/count")),
+        won=_won(record),
+        fixed=_fixed(record),
         fluency=(
             first("fluency_before", fluency[0] if fluency else None),
             first("fluency_after", fluency[-1] if fluency else None),
@@ -82,6 +92,17 @@ def gather(record: Record) -> Facts:
         total_seconds=number(mapping(summary.get("seconds")).get("total")) or sum(seconds.values()) or None,
         versions={visible(k, 100): visible(v, 200) for k, v in mapping(summary.get("versions")).items()},
     )
+
+
+def _won(record: Record) -> Estimate | None:
+    found = record.hindsight.rounds[-1].won if record.hindsight and record.hindsight.rounds else None
+    return found if found is not None and found.value is not None else None
+
+
+def _fixed(record: Record) -> bool:
+    """No round has fitted, and yet a reward had something to say."""
+    fitted = any(value is not None for value in record.series("fit/loss"))
+    return not fitted and any(value is not None for value in record.series("evaluate/learned"))
 
 
 def _seconds(record: Record) -> dict[str, float]:

@@ -59,8 +59,9 @@ class Line:
     """A name in `COLOURS`."""
     label: str = ""
     dash: str = "-"
-    spread: Series = ()
-    """Half the height of a band around the curve, or nothing."""
+    low: Series = ()
+    """The lower edge of a band around the curve, or nothing."""
+    high: Series = ()
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,23 @@ class Bar:
 
 
 def lines(
-    name: str, rounds: Sequence[int], curves: Sequence[Line], percent: bool = False, zero: bool = False
+    name: str,
+    rounds: Sequence[int],
+    curves: Sequence[Line],
+    percent: bool = False,
+    zero: bool = False,
+    beside: float | None = None,
 ) -> Markup:
-    """Curves over the rounds; empty when no curve has a value. `zero` starts the axis at 0, `percent` ends it at 1."""
+    """Curves over the rounds; empty when no curve has a value. `zero` starts the axis at 0, `percent` ends it at 1.
+
+    `beside`: what to compare with, as dashes.
+    """
     drawn = [curve for curve in curves if any(value is not None for value in curve.values)]
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
+        if beside is not None:
+            axes.axhline(beside, color=COLOURS["muted"], linewidth=1.2, linestyle=(0, (4, 3)))
         for curve in drawn:
             _curve(axes, np.array(rounds), curve)
         _values_axis(axes, [v for curve in drawn for v in curve.values if v is not None], percent, zero)
@@ -110,6 +121,23 @@ def path(name: str, x: Series, y: Series, labels: tuple[str, str]) -> Markup:
         axes.set_xlabel(labels[0])
         axes.set_ylabel(labels[1])
         _legend(axes, 2)
+
+    return _svg(name, draw) if len(points) > 1 else Markup("")
+
+
+def against(name: str, x: Series, curves: Sequence[Line], labels: tuple[str, str]) -> Markup:
+    """Curves over another metric, in its order; empty where fewer than two points have all values."""
+    rows = [row for row in zip(x, *(curve.values for curve in curves), strict=True) if None not in row]
+    points = np.array(sorted(rows), float)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        for column, curve in enumerate(curves, 1):
+            colour = COLOURS[curve.colour]
+            axes.plot(points[:, 0], points[:, column], curve.dash, color=colour, label=curve.label, marker="o")
+        axes.set_xlabel(labels[0])
+        axes.set_ylabel(labels[1])
+        _legend(axes, len(curves))
 
     return _svg(name, draw) if len(points) > 1 else Markup("")
 
@@ -201,9 +229,10 @@ def _curve(axes: Axes, rounds: np.ndarray, curve: Line) -> None:
     there = ~np.isnan(values)
     x, y = rounds[there], values[there]
     colour = COLOURS[curve.colour]
-    if curve.spread:
-        spread = np.array([0.0 if value is None else value for value in curve.spread])[there]
-        axes.fill_between(x, y - spread, y + spread, color=colour, alpha=0.16, linewidth=0)
+    if curve.low:
+        edges = ([v if e is None else e for e, v in zip(edge, values, strict=True)] for edge in (curve.low, curve.high))
+        low, high = (np.array(edge)[there] for edge in edges)
+        axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     dots = "o" if len(x) == 1 or (curve.dash == "-" and len(x) <= 25) else ""
     axes.plot(x, y, curve.dash, color=colour, label=curve.label, marker=dots, markersize=4, clip_on=False)
 

@@ -11,23 +11,26 @@ import math
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import yaml
 from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import Bin, ReportCard
+from prefrl.evaluate.card import Bin, Hindsight, ReportCard
+from prefrl.stats.estimates import Part
 from prefrl.types import Json
 
+P = TypeVar("P", bound=Part)
 Json: TypeAlias = Json
 MAX_TEXT = 4_000
 MAX_CONFIG = 50_000
 MAX_PICTURE = 4_000_000
 MAX_EXAMPLES = 24
 BIDI = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-PNG = b"\x89PNG\r\n\x1a\n"
+MAGIC = {"png": b"\x89PNG\r\n\x1a\n", "webp": b"RIFF"}
+"""How files of pictures begin."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Example:
     caption: str
     picture: str
     """A `data:` address of a PNG, or empty."""
+    film: str = ""
+    """A `data:` address of a WebP that plays, or empty."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,8 @@ class Record:
     after: tuple[Example, ...]
     card: ReportCard | None
     """How good the reward model is, where that was measured."""
+    hindsight: Hindsight | None
+    """All rounds by the newest reward, where that was measured."""
     missing: tuple[str, ...]
     """Files that are not there yet, or cannot be read, in words."""
 
@@ -92,7 +99,8 @@ def read(folder: Path) -> Record:
         fitted_round=whole(held_out.get("round")),
         before=_examples(folder / "examples" / "before.json", missing),
         after=_examples(folder / "examples" / "after.json", missing),
-        card=_card(folder / "card.json", missing),
+        card=_part(ReportCard, folder / "card.json", missing),
+        hindsight=_part(Hindsight, folder / "hindsight.json", missing),
         missing=tuple(missing),
     )
 
@@ -193,12 +201,12 @@ def _reliability(held_out: Json, missing: list[str]) -> tuple[Bin, ...]:
     return reliability(*np.array(good, np.float64).T) if good else ()
 
 
-def _card(path: Path, missing: list[str]) -> ReportCard | None:
-    """The report card, where there is one."""
+def _part(cls: type[P], path: Path, missing: list[str]) -> P | None:
+    """What a file holds, where there is one."""
     if not path.is_file():
         return None
     try:
-        return ReportCard.model_validate_json(path.read_bytes())
+        return cls.model_validate_json(path.read_bytes())
     except (ValidationError, OSError):
         missing.append(f"{path.name}: cannot be read")
         return None
@@ -212,7 +220,8 @@ def _examples(path: Path, missing: list[str]) -> tuple[Example, ...]:
 
 
 def _example(entry: Json, folder: Path) -> Example:
-    picture, problem = _picture(entry.get("strip"), folder)
+    picture, problem = _picture(entry.get("strip"), folder, "png")
+    film, _ = _picture(entry.get("film"), folder, "webp")  # one that is missing is no loss: the strip says the same
     return Example(
         gold=number(entry.get("gold")),
         learned=number(entry.get("learned")),
@@ -220,16 +229,17 @@ def _example(entry: Json, folder: Path) -> Example:
         text=visible(entry.get("text")),
         caption=problem or visible(entry.get("caption")),
         picture=picture,
+        film=film,
     )
 
 
-def _picture(name: object, folder: Path) -> tuple[str, str]:
-    """(data address, what is wrong): only a PNG that lies in that very folder is taken, never a path or a link."""
+def _picture(name: object, folder: Path, form: str) -> tuple[str, str]:
+    """(data address, what is wrong): only a picture that lies in that very folder is taken, never a path or a link."""
     if name is None:
         return "", ""
     path = next((p for p in folder.iterdir() if p.name == name and p.is_file() and not p.is_symlink()), None)
     if path is None:
         return "", "The picture is not there."
-    if path.stat().st_size > MAX_PICTURE or not (data := path.read_bytes()).startswith(PNG):
-        return "", "The picture is too large, or no PNG."
-    return "data:image/png;base64," + base64.b64encode(data).decode("ascii"), ""
+    if path.stat().st_size > MAX_PICTURE or not (data := path.read_bytes()).startswith(MAGIC[form]):
+        return "", f"The picture is too large, or no {form.upper()}."
+    return f"data:image/{form};base64," + base64.b64encode(data).decode("ascii"), ""

@@ -14,7 +14,7 @@ from prefrl.report.card_chapter import grades
 from prefrl.report.chapters import chapters
 from prefrl.report.facts import calibration, gather
 from prefrl.report.records import Record, read, visible
-from prefrl.report.words import headline, show_count, show_number, show_share, show_time, verdict
+from prefrl.report.words import changes, headline, show_count, show_number, show_share, show_time, verdict
 from prefrl.storage.files import write_file
 
 
@@ -40,6 +40,7 @@ def render(record: Record) -> str:
         chapters=chapters(record, facts),
         calibration=calibration(record),
         grades=grades(record.card) if record.card else None,
+        changes=changes,
         timed=sum(facts.seconds.values()),
     )
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import re
+from difflib import SequenceMatcher
+
 from prefrl.report.facts import Facts
+from prefrl.report.records import Example
 
 
 def headline(facts: Facts) -> str:
@@ -18,11 +23,42 @@ def headline(facts: Facts) -> str:
     )
     before, after, _ = facts.gold
     if before is None or after is None:
-        return f"There is no gold to tell whether it helped, {took}." if facts.rounds else "No round is over yet."
+        return _without_gold(facts, took) if facts.rounds else "No round is over yet."
     start, end = show_number(before, after), show_number(after, before)
     if start == end:
         return f"Gold stayed at {end} {took}."
     return f"Gold {'rose' if after > before else 'fell'} from {start} to {end} {took}."
+
+
+def _without_gold(facts: Facts, took: str) -> str:
+    if facts.won is None:
+        return f"There is no gold to tell whether it helped, {took}."
+    return f"The policy beats its start in {show_share(facts.won.value)} of its {facts.words.behaviour}s, {took}."
+
+
+def _wins(facts: Facts) -> list[str]:
+    """How sure the win rate is, in a sentence or none."""
+    won, who = facts.won, "the reward it was trained on" if facts.fixed else "its newest reward"
+    if won is None:
+        return []
+    sure = "" if won.low is None else f" (95 % interval {show_share(won.low)} to {show_share(won.high)})"
+    chance = " That may be chance." if won.low is not None and won.low <= 0.5 <= (won.high or 1.0) else ""
+    behaviour = f"{facts.words.behaviour}s"
+    return [
+        f"By {who}, {show_share(won.value)} of {won.count} {behaviour} are worth more than the start's{sure}.{chance}"
+    ]
+
+
+def _noise(facts: Facts, change: float) -> str:
+    """What to say of a change of gold that may be chance; "" where it may not, or nobody can tell."""
+    spreads = [value for value in facts.gold_spread if value is not None]
+    if len(spreads) < 2:
+        return ""
+    if facts.measured is None:
+        small = abs(change) < min(spreads)
+        return f"smaller than one standard deviation between {facts.words.behaviour}s" if small else ""
+    error = math.hypot(*spreads) / math.sqrt(facts.measured)
+    return f"within the noise of {facts.measured} {facts.words.behaviour}s" if abs(change) < 1.96 * error else ""
 
 
 def verdict(facts: Facts) -> str:
@@ -30,14 +66,13 @@ def verdict(facts: Facts) -> str:
     before, after, best = facts.gold
     remarks = []
     if before is not None and after is not None:
-        spreads = [value for value in facts.gold_spread if value is not None]
         if after < before:
             remarks.append("The policy got worse.")
-        if after != before and spreads and abs(after - before) < min(spreads):
-            what = f"{facts.words.behaviour}s"
-            remarks.append(f"The change is smaller than one standard deviation between {what}.")
+        if after != before and (noise := _noise(facts, after - before)):
+            remarks.append(f"The change is {noise}.")
         if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
+    remarks += _wins(facts)
     start, end = facts.fluency
     if start is not None and end is not None:
         if show_share(start) == show_share(end):
@@ -46,6 +81,16 @@ def verdict(facts: Facts) -> str:
             change = "fell" if end < start else "rose"
             remarks.append(f"Fluency {change} from {show_share(start)} to {show_share(end)}.")
     return " ".join(remarks)
+
+
+def changes(before: Example | None, after: Example) -> list[tuple[str, bool]]:
+    """A text in parts, each with whether it is new beside what was there before for the same prompt; all old if
+    nothing was."""
+    if before is None or before.prompt != after.prompt or not before.text:
+        return [(after.text, False)]
+    old, new = (re.findall(r"\s*\S+|\s+$", text) for text in (before.text, after.text))
+    matcher = SequenceMatcher(None, [word.strip() for word in old], [word.strip() for word in new], autojunk=False)
+    return [("".join(new[a:b]), tag != "equal") for tag, _, _, a, b in matcher.get_opcodes() if b > a]
 
 
 def show_number(value: float | None, beside: float | None = None) -> str:

@@ -61,6 +61,20 @@ def mean(
     return defined(np.array([value]), (s[:, 0] / s[:, 1] for s in sums), units, Estimate(count=len(hits)), what, 0.0)
 
 
+def average(values: Floats, what: str = "candidates") -> Estimate:
+    """The mean of values (n,), with Student's interval; without one where there are fewer than two."""
+    if not len(values):
+        return undefined("nothing was scored")
+    found = Estimate(value=float(values.mean()), count=len(values))
+    error = float(stats.sem(values)) if len(values) > 1 else 0.0
+    if not error:
+        return found.model_copy(update={"how": "no interval: there is no spread"})
+    low, high = stats.t.interval(0.95, len(values) - 1, found.value, error)
+    return found.model_copy(
+        update={"low": float(low), "high": float(high), "how": f"Student over {len(values)} {what}"}
+    )
+
+
 def defined(
     value: Floats,
     drawn: Iterator[Floats],

@@ -55,6 +55,9 @@ def test_segments_are_kept_as_strips_that_a_report_can_read(tmp_path: Path) -> N
     with Image.open(path.parent / entries[1]["strip"]) as picture:
         assert picture.height == 160
     assert [e.picture[:22] for e in read(tmp_path).before] == ["data:image/png;base64,"] * 2
+    with Image.open(path.parent / entries[0]["film"]) as film:
+        assert (getattr(film, "n_frames"), film.height) == (15, 160)  # noqa: B009 - every second frame
+    assert [e.film[:23] for e in read(tmp_path).before] == ["data:image/webp;base64,"] * 2
 
 
 def test_a_renderer_that_fails_leaves_a_caption(tmp_path: Path) -> None:

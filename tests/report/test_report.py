@@ -11,12 +11,13 @@ import pytest
 from PIL import Image
 
 from prefrl.report.facts import gather
-from prefrl.report.records import MAX_TEXT, number, read, visible
+from prefrl.report.records import MAX_TEXT, Example, number, read, visible
 from prefrl.report.report import write_report
-from prefrl.report.words import headline, show_count, show_number, show_share, show_time, verdict
+from prefrl.report.words import changes, headline, show_count, show_number, show_share, show_time, verdict
 
 WILD = "</pre></title><script>alert(1)</script><img src=x onerror=alert(1)>\u202e\u2066\"'{{ 7*7 }}\x00\x1b[31m\ud800"
 CSP = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+INSIDE = ("data:image/png;base64,", "data:image/webp;base64,", "#")
 VOID = {"meta", "img", "br"}
 
 
@@ -103,7 +104,7 @@ def check_harmless(found: Page) -> None:
     assert not found.tags & {"script", "iframe", "object", "embed", "link", "base", "form", "foreignobject"}
     assert not [name for _, name, _ in found.attributes if name.startswith("on")]
     for _, name, value in found.attributes:
-        assert name not in ("src", "href", "xlink:href") or value.startswith(("data:image/png;base64,", "#"))
+        assert name not in ("src", "href", "xlink:href") or value.startswith(INSIDE)
     assert len(found.ids) == len(set(found.ids))
 
 
@@ -149,6 +150,55 @@ def test_without_gold_nothing_is_claimed(tmp_path: Path) -> None:
     missing = {"gold_before": None, "gold_after": None, "gold_best": None}
     found = page(run_folder(tmp_path / "run", lines, summary=summary(**missing)))
     assert "There is no gold to tell whether it helped, in 3 rounds" in found.text
+
+
+def seen(rounds: int, **won: float) -> dict[str, Any]:
+    """A hindsight in which every round but the first wins so often."""
+    learned = {"value": 1.0, "low": 0.5, "high": 1.5, "count": 20}
+    rows = [{"round": i, "learned": learned, "won": {"count": 20} | won if i else {}} for i in range(rounds)]
+    return {"fitted_round": 3, "rounds": rows}
+
+
+def test_without_gold_the_win_rate_stands_in_its_place_and_no_panel_is_empty(tmp_path: Path) -> None:
+    blind = {"evaluate/gold": None, "evaluate/gold_std": None, "improve/entropy": 1.0}
+    lines = [line(i, **blind) for i in range(4)]
+    said = summary(gold_before=None, gold_after=None, gold_best=None)
+    folder = run_folder(tmp_path / "run", lines, summary=said, hindsight=seen(4, value=0.95, low=0.76, high=0.99))
+    found = page(folder)
+    assert "The policy beats its start in 95 % of its episodes, in 3 rounds" in found.text
+    assert "95 % of 20 episodes are worth more than the start's (95 % interval 76 % to 99 %)." in found.text
+    for word in ("Gold, hidden", "Do the two agree?", "Calibration", "That may be chance"):
+        assert word not in found.text
+    assert found.text.count("Not there yet") == 2  # the examples, which are missing
+
+
+def test_a_win_rate_that_may_be_chance_is_called_so(tmp_path: Path) -> None:
+    chance = seen(2, value=0.6, low=0.4, high=0.8)
+    folder = run_folder(tmp_path / "run", [line(0), line(1)], summary=summary(), hindsight=chance)
+    assert "That may be chance." in page(folder).text
+
+
+def test_a_reward_that_the_run_began_with_is_not_called_fitted(tmp_path: Path) -> None:
+    lines = [{key: value for key, value in line(i).items() if not key.startswith("fit/")} for i in range(4)]
+    found = page(run_folder(tmp_path / "run", lines, summary=summary()))
+    assert "the reward that the run began with, the same in all rounds" in found.text
+    assert "anew" not in found.text
+    assert "Was the reward model right?" not in found.text
+
+
+def test_noise_is_told_from_change_by_the_intervals_of_the_means(tmp_path: Path) -> None:
+    lines = [line(i, **{"evaluate/count": 100.0, "evaluate/gold_std": 40.0}) for i in range(2)]
+    near = page(run_folder(tmp_path / "near", lines, summary=summary(gold_after=-95.0)))
+    far = page(run_folder(tmp_path / "far", lines, summary=summary(gold_after=-70.0)))
+    assert "The change is within the noise of 100 episodes." in near.text
+    assert "within the noise" not in far.text
+    assert "The band is the 95 % interval of the mean." in far.text
+
+
+def test_words_that_are_new_are_marked() -> None:
+    before, after = (Example(None, None, "p", text, "", "") for text in ("a good film", "a very good film indeed"))
+    assert changes(before, after) == [("a", False), (" very", True), (" good film", False), (" indeed", True)]
+    assert changes(None, after) == [(after.text, False)]
 
 
 def test_a_run_still_going_on_says_so(tmp_path: Path) -> None:
@@ -255,7 +305,7 @@ def test_only_png_files_of_the_examples_folder_are_shown(tmp_path: Path) -> None
 def test_figures_are_well_formed_and_take_the_pages_colours(tmp_path: Path) -> None:
     html = write_report(whole_run(tmp_path / "run")).read_text("utf-8")
     figures = [part.split("</svg>")[0] + "</svg>" for part in html.split("<svg")[1:]]
-    assert len(figures) == 9
+    assert len(figures) == 8
     for figure in figures:
         ElementTree.fromstring("<svg" + figure)
         assert "#0101" not in figure
