@@ -34,7 +34,7 @@ WRITES = (*TASK, "learner.updates=30", "learner.schedule=linear")
 LEARNERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "RLOO": ("text/reviews-rubric", ()),
     "RLOO, worst of three": ("text/reviews-rubric", ("reward.combine.by=worst",)),
-    "PPO": ("text/reviews-ppo", (*WRITES, "learner.beta=0.2")),
+    "PPO": ("text/reviews-ppo", (*WRITES, "learner.beta=0.2", "learner.critic.network=shared")),
     "online DPO": ("text/reviews-online-dpo", (*WRITES, "learner.beta=0.2")),
     "RAFT": ("text/reviews-raft", (*WRITES, "learner.beta=0.2")),
     "DPO": ("text/reviews-dpo", TASK),
