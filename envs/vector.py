@@ -70,8 +70,8 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
     """n environments of one id, stepped as gymnasium's `SyncVectorEnv` steps them, only faster.
 
     Observations, terminations, truncations and first states are `SyncVectorEnv`'s to the bit for the same seeds,
-    rewards too; Pendulum's rewards and Acrobot's first observations are to rounding. Episodes end where gymnasium ends them: a
-    fixed horizon is the control task's. `terminate_when_unhealthy=False` lets Ant, Hopper and Walker2d go on.
+    rewards too; Pendulum's rewards and Acrobot's first observations are to rounding. Episodes end where gymnasium ends
+    them: a fixed horizon is the control task's. `terminate_when_unhealthy=False` lets Ant, Hopper and Walker2d go on.
 
     Infos hold `final_obs` (with `autoreset_mode="SameStep"`), as gymnasium's do, and nothing else: the parts of a
     reward and a body's place are not computed. Nothing is drawn. Raises `ValueError` for an option that it does not

@@ -86,7 +86,7 @@ def test_what_the_fast_stepper_does_not_know_is_refused() -> None:
     with pytest.raises(ValueError, match=r"only the option reset_mask here, got \['low'\]"):
         envs.reset(options={"low": 0.0})
     with pytest.raises(ValueError, match="expected 2 seeds"):
-        envs.reset(seed=[1])
+        envs.reset(seed=[1])  # type: ignore[arg-type]  # gymnasium's own takes lists as well
     envs.reset()
     with pytest.raises(ValueError, match=r"actions of shape \(2, 1\), got \(2,\)"):
         envs.step(np.zeros(2))
