@@ -66,8 +66,17 @@ class ControlSettings(Settings):
     """How many of the last observations are seen at once."""
     frame_size: int = Field(240, ge=16, le=2048)
     """Height and width of drawn frames, in pixels."""
+    step_seconds: float | None = Field(None, gt=0)
+    """End the process, with status 124, when a step or a reset of one environment takes longer; null waits for ever.
+    The environments with steppers of our own are not watched."""
     fps: float | None = Field(None, gt=0)
     """Control steps per simulated second; only needed where the environment does not say."""
+
+    def lasting(self) -> ControlSettings:
+        return self.model_copy(update={"step_seconds": None})
+
+    def identity(self) -> ControlSettings:
+        return self.lasting()
 
     def build(self) -> GymnasiumTask:
         """Raises `ConfigError` for an unknown id, spaces that cannot be learned and impossible lengths."""
@@ -79,7 +88,7 @@ class ControlSettings(Settings):
         name = self.env if plain is single and not self.options else ""
         action, size = env.action_space, math.prod(env.observation_space.shape or ())
         after: AfterEnd = "end" if self.variable_horizon else self.after_end
-        environments = partial(_environments, name, plain, horizon, after)
+        environments = partial(_environments, name, plain, horizon, after, self.step_seconds)
         if self.hide or self.flicker or self.stack > 1:
             environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)
         for one in (probe, env):
@@ -196,17 +205,19 @@ class GymnasiumTask:
         return frames(self.name, segment, self.frame_size)
 
 
-def _environments(name: str, single: Make, horizon: int, after: AfterEnd, count: int) -> Environments:
+def _environments(
+    name: str, single: Make, horizon: int, after: AfterEnd, seconds: float | None, count: int
+) -> Environments:
     """The fastest stepper there is for an environment."""
     if after == "restart":  # the others know no fresh start within an episode
-        return Wrapped(single, count, horizon, after)
+        return Wrapped(single, count, horizon, after, seconds)
     if name in WORLDS:
         return Vectorised(WORLDS[name](after == "end"), count, horizon)
     if name in BODIES:
         from prefrl.envs.fast.simulated import Simulated
 
         return Simulated(name, single, count, horizon, after != "end")
-    return Wrapped(single, count, horizon, after)
+    return Wrapped(single, count, horizon, after, seconds)
 
 
 def _partial(

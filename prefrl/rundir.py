@@ -15,6 +15,7 @@ import numpy as np
 
 from prefrl.components import Settings
 from prefrl.config import Config
+from prefrl.envs.fast.watched import EnvironmentFault
 from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
@@ -91,9 +92,23 @@ class Run:
         self.store.close()
 
     def __iter__(self) -> Iterator[Round]:
-        for round in rounds(self.loop):
+        turns = rounds(self.loop)
+        while (round := self._next(turns)) is not None:
             self._record(round)
             yield round
+
+    def _next(self, turns: Iterator[Round]) -> Round | None:
+        """The next round; what went wrong in the simulator or in the numbers says from where the run can go on."""
+        try:
+            return next(turns, None)
+        except (FloatingPointError, EnvironmentFault) as error:
+            raise type(error)(f"{error}\n{self._left()}") from error
+
+    def _left(self) -> str:
+        if not _checkpoints(self.folder):
+            return f"no round was finished: nothing is lost in {self.folder}"
+        folder, _ = _newest(self.folder)
+        return f"the last good checkpoint is {folder}; once that is dealt with, go on with: prefrl resume {self.folder}"
 
     @property
     def summary(self) -> Json:

@@ -48,7 +48,7 @@ class Body:
 
     start: Start
     observe: Callable[[Snapshot], Floats]
-    """(n, O) float32, a new array."""
+    """(n, O) float64, a new array."""
     reward: Callable[[Snapshot, Floats, Floats, Bools], Floats]
     """The state after a step, its actions (n, A) float32, the speed forward (n,) and health (n,) -> (n,)."""
     healthy: Callable[[Snapshot], Bools] = _always
@@ -90,7 +90,8 @@ def _effort(actions: Floats) -> Floats:
 def _joints(now: Snapshot, hidden: int = 1, clip: float = np.inf) -> Floats:
     """Positions but the first `hidden`, and clipped velocities."""
     velocities = now.velocities if clip == np.inf else np.clip(now.velocities, -clip, clip)
-    return np.concatenate([now.positions[:, hidden:], velocities], 1).astype(np.float32)
+    found: Floats = np.concatenate([now.positions[:, hidden:], velocities], 1)
+    return found
 
 
 def _progress(
@@ -129,7 +130,8 @@ def _ant_contacts(now: Snapshot) -> Floats:
 
 def _ant_observe(now: Snapshot) -> Floats:
     contacts = _ant_contacts(now)[:, 6:]
-    return np.concatenate([now.positions[:, 2:], now.velocities, contacts], 1).astype(np.float32)
+    found: Floats = np.concatenate([now.positions[:, 2:], now.velocities, contacts], 1)
+    return found
 
 
 def _ant_reward(now: Snapshot, actions: Floats, speed: Floats, healthy: Bools) -> Floats:
@@ -167,7 +169,8 @@ def _reacher_observe(now: Snapshot) -> Floats:
     """Angles of the arm as cosines and sines, the target, the arm's velocities, and from the target to the tip."""
     angles, apart = now.positions[:, :2], now.derived[:, :2] - now.derived[:, 3:5]
     parts = [np.cos(angles), np.sin(angles), now.positions[:, 2:], now.velocities[:, :2], apart]
-    return np.concatenate(parts, 1).astype(np.float32)
+    found: Floats = np.concatenate(parts, 1)
+    return found
 
 
 def _reacher_reward(now: Snapshot, actions: Floats, speed: Floats, healthy: Bools) -> Floats:
@@ -190,7 +193,8 @@ def _pusher_derived(data: Any) -> list[Floats]:
 
 
 def _pusher_observe(now: Snapshot) -> Floats:
-    return np.concatenate([now.positions[:, :7], now.velocities[:, :7], now.derived], 1).astype(np.float32)
+    found: Floats = np.concatenate([now.positions[:, :7], now.velocities[:, :7], now.derived], 1)
+    return found
 
 
 def _pusher_reward(now: Snapshot, actions: Floats, speed: Floats, healthy: Bools) -> Floats:
@@ -221,7 +225,8 @@ def _poles_observe(now: Snapshot) -> Floats:
     """The cart's place, sines and cosines of the poles, clipped velocities, the clipped force that holds the cart."""
     angles, rest = now.positions[:, 1:], np.concatenate([now.velocities, now.derived[:, 3:4]], 1)
     parts = [now.positions[:, :1], np.sin(angles), np.cos(angles), np.clip(rest, -10.0, 10.0)]
-    return np.concatenate(parts, 1).astype(np.float32)
+    found: Floats = np.concatenate(parts, 1)
+    return found
 
 
 def _poles_reward(now: Snapshot, actions: Floats, speed: Floats, healthy: Bools) -> Floats:

@@ -6,7 +6,7 @@ control step at a time it loses the solver's warm start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import gymnasium
@@ -16,6 +16,61 @@ import numpy as np
 from prefrl.envs.fast.bodies import BODIES, Snapshot
 from prefrl.protocols import Transition
 from prefrl.types import Bools, Floats
+
+
+class Bodies:
+    """n simulators of a body of `prefrl.envs.fast.bodies`, each started and advanced when it is asked to.
+
+    `env` is the gymnasium environment whose model and first state are used.
+    """
+
+    def __init__(self, name: str, env: Any, count: int) -> None:
+        self._body = BODIES[name]
+        self._model = env.model
+        self._frames = env.frame_skip
+        self._dt = env.dt
+        self._first = env.init_qpos.copy(), env.init_qvel.copy()
+        self._data = [mujoco.MjData(env.model) for _ in range(count)]
+        # Views into each simulator's own memory, made once.
+        self._controls = [data.ctrl for data in self._data]
+        self._memory = [(data.qpos, data.qvel) for data in self._data]
+        sources = [[view.reshape(-1) for view in self._body.derived(data)] for data in self._data]
+        places, width = env.model.nq, sum(map(len, sources[0])) if count else 0
+        self.states: Floats = np.zeros((count, places + env.model.nv))
+        """(n, nq + nv), written in place."""
+        self.now = Snapshot(self.states[:, :places], self.states[:, places:], np.zeros((count, width)))
+        self._copies = [list(_pairs(self.now, i, [*self._memory[i], *sources[i]])) for i in range(count)]
+
+    def start(self, i: int, rng: np.random.Generator) -> None:
+        """Begin an episode of one of them."""
+        data, (qpos, qvel) = self._data[i], self._memory[i]
+        # Also clears the solver's warm start: what an episode does must not hang on the one before it.
+        mujoco.mj_resetData(self._model, data)
+        qpos[:], qvel[:] = self._body.start(*self._first, rng)
+        mujoco.mj_forward(self._model, data)  # what is derived from positions and velocities must follow them
+        self._read(i)
+
+    def advance(self, actions: Floats, which: Iterable[int]) -> tuple[Floats, Bools]:
+        """One step of those in `which`: (n,) rewards and health. Those of the others mean nothing."""
+        body, now = self._body, self.now
+        before = body.place(now).copy()  # a copy: the snapshot is written in place
+        for i in which:
+            data = self._data[i]
+            self._controls[i][:] = actions[i]
+            mujoco.mj_step(self._model, data, nstep=self._frames)
+            if body.contact_forces:
+                mujoco.mj_rnePostConstraint(self._model, data)
+            self._read(i)
+        healthy = body.healthy(now)
+        return body.reward(now, actions, (body.place(now) - before) / self._dt, healthy), healthy
+
+    def observe(self) -> Floats:
+        """(n, O) float64, a new array."""
+        return self._body.observe(self.now)
+
+    def _read(self, i: int) -> None:
+        for target, source in self._copies[i]:
+            target[:] = source
 
 
 class Simulated:
@@ -31,21 +86,7 @@ class Simulated:
     def __init__(
         self, name: str, make: Callable[[], gymnasium.Env[Any, Any]], count: int, horizon: int, fixed_horizon: bool
     ) -> None:
-        env: Any = make().unwrapped
-        self._body = BODIES[name]
-        self._model = env.model
-        self._frames = env.frame_skip
-        self._dt = env.dt
-        self._first = env.init_qpos.copy(), env.init_qvel.copy()
-        self._data = [mujoco.MjData(env.model) for _ in range(count)]
-        # Views into each simulator's own memory, made once.
-        self._controls = [data.ctrl for data in self._data]
-        self._memory = [(data.qpos, data.qvel) for data in self._data]
-        sources = [[view.reshape(-1) for view in self._body.derived(data)] for data in self._data]
-        places, width = env.model.nq, sum(map(len, sources[0])) if count else 0
-        self._states = np.zeros((count, places + env.model.nv))
-        self._now = Snapshot(self._states[:, :places], self._states[:, places:], np.zeros((count, width)))
-        self._copies = [list(_pairs(self._now, i, [*self._memory[i], *sources[i]])) for i in range(count)]
+        self._bodies = Bodies(name, make().unwrapped, count)
         self._elapsed = np.zeros(count, np.int64)
         self._horizon = horizon
         self._terminate = not fixed_horizon
@@ -53,50 +94,35 @@ class Simulated:
 
     def reset(self, rng: np.random.Generator) -> Floats:
         self._rng = rng
-        for i in range(len(self._data)):
+        for i in range(len(self._elapsed)):
             self._start(i)
-        return self._body.observe(self._now)
+        return self._observe()
 
     def step(self, actions: Floats) -> Transition:
-        body, now = self._body, self._now
-        before = body.place(now).copy()  # a copy: the snapshot is written in place
-        for i, data in enumerate(self._data):
-            self._controls[i][:] = actions[i]
-            mujoco.mj_step(self._model, data, nstep=self._frames)
-            if body.contact_forces:
-                mujoco.mj_rnePostConstraint(self._model, data)
-            self._read(i)
-        healthy = body.healthy(now)
-        rewards = body.reward(now, actions, (body.place(now) - before) / self._dt, healthy)
+        rewards, healthy = self._bodies.advance(actions, range(len(self._elapsed)))
         self._elapsed += 1
         terminated = ~healthy & self._terminate
         truncated = (self._elapsed >= self._horizon) & ~terminated
-        final = observations = body.observe(now)
+        final = observations = self._observe()
         ended = np.flatnonzero(terminated | truncated)
         for i in ended.tolist():
             self._start(i)
         if len(ended):
-            observations = body.observe(now)
+            observations = self._observe()
         return Transition(observations, rewards, terminated, truncated, final)
 
     def states(self) -> Floats:
-        return self._states
+        return self._bodies.states
 
     def legal(self) -> Bools | None:
         return None
 
     def _start(self, i: int) -> None:
-        data, (qpos, qvel) = self._data[i], self._memory[i]
-        # Also clears the solver's warm start: what an episode does must not hang on the one before it.
-        mujoco.mj_resetData(self._model, data)
-        qpos[:], qvel[:] = self._body.start(*self._first, self._rng)
-        mujoco.mj_forward(self._model, data)  # what is derived from positions and velocities must follow them
+        self._bodies.start(i, self._rng)
         self._elapsed[i] = 0
-        self._read(i)
 
-    def _read(self, i: int) -> None:
-        for target, source in self._copies[i]:
-            target[:] = source
+    def _observe(self) -> Floats:
+        return self._bodies.observe().astype(np.float32)
 
 
 def _pairs(now: Snapshot, i: int, sources: list[Floats]) -> Iterator[tuple[Floats, Floats]]:

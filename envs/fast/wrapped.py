@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias
 import gymnasium
 import numpy as np
 
+from prefrl.envs.fast.watched import EnvironmentFault, guarded
 from prefrl.protocols import Transition
 from prefrl.seeding import draw_seed
 from prefrl.types import Bools, Floats
@@ -23,10 +24,23 @@ class Wrapped:
     `build` makes one, its time limit included. An episode that the environment ends goes on to its horizon, or its
     length would tell the reward model and the policy how it was judged: where it ended, with a reward of 0 a step
     (`absorb`, as in seals), or from a fresh start, of which the learner is not told (`restart`). `end` lets it end.
+
+    Raises `EnvironmentFault`, which names the environment and its step, where one raises, gives an observation of
+    another shape or type than its first, or a reward that is not finite. A call that takes longer than `step_seconds`
+    ends the process.
     """
 
-    def __init__(self, build: Callable[[], gymnasium.Env[Any, Any]], count: int, horizon: int, after: AfterEnd) -> None:
+    def __init__(
+        self,
+        build: Callable[[], gymnasium.Env[Any, Any]],
+        count: int,
+        horizon: int,
+        after: AfterEnd,
+        step_seconds: float | None = None,
+    ) -> None:
         self._envs = [build() for _ in range(count)]
+        self._seconds = step_seconds
+        self._form: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._horizon, self._after = horizon, after
         self._discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
         self._last: Floats = np.zeros((count, 0), np.float32)
@@ -36,17 +50,20 @@ class Wrapped:
 
     def reset(self, rng: np.random.Generator) -> Floats:
         self._over[:], self._elapsed[:] = False, 0
-        self._last = np.stack([env.reset(seed=draw_seed(rng))[0] for env in self._envs]).astype(np.float32)
+        first = [self._reset(i, draw_seed(rng)) for i in range(len(self._envs))]
+        self._last = np.stack(first).astype(np.float32)
         return self._last.copy()
 
     def step(self, actions: Floats) -> Transition:
         final, rewards = self._last.copy(), np.zeros(len(actions))
         terminated, truncated = np.zeros(len(actions), bool), np.zeros(len(actions), bool)
         for i in np.flatnonzero(~self._over).tolist():
-            env = self._envs[i]
-            final[i], rewards[i], terminated[i], truncated[i], _ = env.step(self._action(env, actions[i]))
+            final[i], rewards[i], terminated[i], truncated[i] = self._step(i, actions[i])
             if terminated[i] and self._after == "restart":
-                final[i] = env.reset()[0]  # without a seed: the generator that `reset` seeded goes on
+                final[i] = self._reset(i)  # without a seed: the generator that `reset` seeded goes on
+        if not np.isfinite(rewards).all():
+            i = int(np.flatnonzero(~np.isfinite(rewards))[0])
+            raise EnvironmentFault(f"{self._where(i)}: its reward is {rewards[i]}, after action {actions[i]}")
         self._elapsed += 1
         if self._after == "absorb":
             self._over |= terminated
@@ -55,8 +72,34 @@ class Wrapped:
         ended = terminated | truncated
         self._last = final.copy()  # a reset must not change what the step led to
         for i in np.flatnonzero(ended).tolist():
-            self._last[i], self._over[i], self._elapsed[i] = self._envs[i].reset()[0], False, 0
+            self._last[i], self._over[i], self._elapsed[i] = self._reset(i), False, 0
         return Transition(self._last.copy(), rewards, terminated, truncated & ~terminated, final)
+
+    def _reset(self, i: int, seed: int | None = None) -> Floats:
+        with guarded(f"a reset of environment {i}", self._seconds):
+            observation: Floats = self._envs[i].reset(seed=seed)[0]
+        self._check_form(i, observation)
+        return observation
+
+    def _step(self, i: int, action: Floats) -> tuple[Floats, Any, bool, bool]:
+        env = self._envs[i]
+        chosen = self._action(env, action)
+        with guarded(self._where(i), self._seconds):
+            observation, reward, terminated, truncated, _ = env.step(chosen)
+        self._check_form(i, observation)
+        return observation, reward, terminated, truncated
+
+    def _check_form(self, i: int, observation: Floats) -> None:
+        found = np.shape(observation), np.asarray(observation).dtype
+        self._form = self._form or found
+        if found != self._form:
+            raise EnvironmentFault(
+                f"{self._where(i)}: its observation has shape {found[0]} and type {found[1]}, but the first one had "
+                f"{self._form[0]} and {self._form[1]}"
+            )
+
+    def _where(self, i: int) -> str:
+        return f"environment {i}, step {self._elapsed[i]} of its episode"
 
     def states(self) -> Floats | None:
         rows = [physics_state(env) for env in self._envs]

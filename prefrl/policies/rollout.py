@@ -74,6 +74,12 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
         # before the step: a segment shows the state in which each action was taken
         states, legal = envs.states(), envs.legal()
         choices, actions = act(observations, legal)
+        if not np.isfinite(actions).all():
+            env = int(np.argwhere(~np.isfinite(actions))[0][0])
+            raise FloatingPointError(
+                f"the action of environment {env} in step {t} of the rollout is {actions[env]}, at observation "
+                f"{observations[env]}; the policy's weights are no longer finite"
+            )
         step = envs.step(actions)
         # A copy: some simulators go on writing into the array that they gave out.
         rows.append((observations, choices, actions, step, None if states is None else states.copy(), legal))

@@ -66,7 +66,7 @@ def test_an_unhealthy_body_ends_its_episode_only_when_asked_to(name: str) -> Non
         envs.reset(np.random.default_rng(0))
     rng = np.random.default_rng(1)
     for _ in range(999):
-        actions = rng.uniform(-1, 1, (4, len(going._controls[0]))).astype(np.float32)
+        actions = rng.uniform(-1, 1, (4, len(going._bodies._controls[0]))).astype(np.float32)
         one, other = ending.step(actions), going.step(actions)
         assert np.array_equal(one.rewards, other.rewards)
         assert not other.terminated.any()
@@ -99,9 +99,9 @@ def test_what_is_to_be_reached_or_pushed_lies_where_it_can_be() -> None:
         envs = _envs(name, 40)
         envs.reset(np.random.default_rng(0))
         joints = slice(2, 4) if name == "Reacher-v5" else slice(7, 9)
-        apart = np.hypot(*envs._now.positions[:, joints].T)
+        apart = np.hypot(*envs._bodies.now.positions[:, joints].T)
         assert nearest < apart.min() < apart.max() < furthest
-        assert not envs._now.velocities[:, joints].any()
+        assert not envs._bodies.now.velocities[:, joints].any()
 
 
 def test_the_task_takes_the_fast_stepper_and_others_the_general_one() -> None:
