@@ -400,15 +400,15 @@ def test_where_a_policy_draws_nothing_first_questions_are_about_random_actions(n
     assert [s.id for s in pool] == [s.id for s in again]
 
 
-def test_sums_over_several_steps_learn_in_the_loop(store: Store[Segment]) -> None:
-    learner = _learner(point(), {**SAC_, "options": {**SAC_["options"], "n_steps": 3}})
+def test_sums_over_several_steps_learn_in_the_loop_and_stop_where_a_round_ends(store: Store[Segment]) -> None:
+    learner = _learner(point(), {**SAC_, "options": {**SAC_["options"], "n_steps": 3}}, steps_per_round=60)
     for number in range(2):
         learner.improve(Known(), store, np.random.default_rng(number))
     buffer = learner.model.replay_buffer
     assert isinstance(buffer, NStepReplayBuffer)
-    cuts = (buffer.timeouts[:75] > 0) & ~(buffer.dones[:75] > 0)
-    assert not cuts.any()  # every round ends with its episodes here
-    np.testing.assert_allclose(buffer.rewards, 1 - 2 * np.abs(buffer.observations[..., 0]), atol=1e-6)
+    # Episodes of 20 steps end at their time; a round of 30 ends in the middle of one.
+    assert np.flatnonzero(buffer.timeouts[:60, 0]).tolist() == [19, 29, 49, 59]
+    np.testing.assert_allclose(buffer.rewards[:60], 1 - 2 * np.abs(buffer.observations[:60, :, 0]), atol=1e-6)
 
 
 def test_a_policy_with_a_memory_is_refused_with_what_to_do() -> None:
