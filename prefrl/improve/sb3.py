@@ -90,9 +90,9 @@ class SB3Settings(Settings):
     explore_steps: int = Field(0, ge=0)
     """Environment steps before the first question, in which an algorithm with an actor and a replay buffer looks for
     states unlike those it has seen (PEBBLE); the first questions are about what it did then."""
-    rollback: float | None = Field(0.1, ge=0)
+    rollback: float | None = Field(None, ge=0)
     """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
-    one; null keeps whatever comes."""
+    one (0.1, say); null keeps whatever comes, and no best policy beside the last one."""
     options: dict[str, JsonValue] = Field(default_factory=dict)
     """Arguments of the algorithm (learning_rate, gamma, batch_size, ...), as its own documentation names them."""
     policy: dict[str, JsonValue] = Field(default_factory=dict)

@@ -138,7 +138,8 @@ def test_the_best_policy_of_a_run_can_be_evaluated_beside_the_last_one(tmp_path:
 
 
 def test_stable_baselines3_has_a_best_policy_too(tmp_path: Path) -> None:
-    config = shrink(Config.load("control/toy", ["learner.kind=sb3", "learner.steps_per_round=128"]))
+    changes = ["learner.kind=sb3", "learner.steps_per_round=128", "learner.rollback=0.1"]
+    config = shrink(Config.load("control/toy", changes))
     with Run(config, tmp_path / "run") as run:
         list(run)
     best, of = evaluate(tmp_path / "run", best=True)

@@ -330,7 +330,7 @@ def _all(learner: SB3, value: float) -> None:
 
 @pytest.mark.parametrize("name", ["PPO", "SAC", "CrossQ"])
 def test_a_policy_that_lost_clearly_goes_back_and_what_is_replayed_stays(store: Store[Segment], name: Name) -> None:
-    learner, rng = _learner(_task(name), _settings(name)), np.random.default_rng
+    learner, rng = _learner(_task(name), _settings(name), rollback=0.1), np.random.default_rng
     learner.improve(Known(), store, rng(0))
     _all(learner, 0.0)
     learner.evaluate(Known(), rng(1))
@@ -366,7 +366,7 @@ def _assert_same(one: dict[int, Any], other: dict[int, Any]) -> None:
 
 
 def test_without_rollback_the_last_policy_stands(store: Store[Segment]) -> None:
-    learner = _learner(point(), SAC_, rollback=None)
+    learner = _learner(point(), SAC_)
     for number in range(2):
         learner.improve(Known(), store, np.random.default_rng(number))
         if number:
