@@ -344,9 +344,8 @@ class RewardSettings(Protocol):
     def build(self, task: Any, rng: np.random.Generator) -> RewardModel: ...
 
 
-@runtime_checkable
-class StepRewardModel(RewardModel[Segment], Protocol):
-    """A reward model for control: a segment's score is the sum of its steps' rewards."""
+class StepRewards(Protocol):
+    """Rewards of steps, whether they are fitted or not."""
 
     def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
         """(B, T) rewards of observations (B, T, O) and actions (B, T, A): shifted, scaled, put together.
@@ -358,6 +357,11 @@ class StepRewardModel(RewardModel[Segment], Protocol):
     @property
     def memory(self) -> int:
         """How many steps a reward looks at: 1 where it hangs on its own step alone."""
+
+
+@runtime_checkable
+class StepRewardModel(RewardModel[Segment], StepRewards, Protocol):
+    """A reward model for control: a segment's score is the sum of its steps' rewards."""
 
 
 class Inputs(Protocol):
@@ -545,6 +549,7 @@ __all__ = [
     "Selector",
     "SelectorSettings",
     "StepRewardModel",
+    "StepRewards",
     "Store",
     "Swapping",
     "Task",

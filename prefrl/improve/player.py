@@ -31,6 +31,16 @@ class Player:
             self.steps = self.steps.add(query=rollout.ends.size)
         return cut(rollout, self._task.segment_steps, count, f"round {self.rounds}", rng)
 
+    @property
+    def moved(self) -> bool:
+        """Whether there is a rollout to cut segments from."""
+        return self._recent is not None
+
+    def explored(self, rollout: Rollout) -> None:
+        """This was done before the first round; the first segments are cut from it."""
+        self._recent = rollout
+        self.steps = self.steps.add(learn=rollout.ends.size)
+
     def learned_from(self, rollout: Rollout) -> None:
         """A round is over, in which this was done."""
         self._recent, self.rounds = rollout, self.rounds + 1

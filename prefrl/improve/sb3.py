@@ -2,34 +2,38 @@
 
 In a script: `env = LearnedReward(any_vec_env, reward_model)`, and after each fit of the reward model
 `relabel(model.replay_buffer, reward_model)` where the algorithm keeps a replay buffer. True rewards are never used.
+`explore_steps` before the first question and SAC make it PEBBLE (Lee, Smith and Abbeel 2021; `explore.py` says what
+differs).
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from pydantic import Field, JsonValue
+from pydantic import Field, JsonValue, model_validator
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings, missing
+from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
-from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
+from prefrl.improve.replay import cut, load_replay, relabel, replay_state
+from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
 from prefrl.policies.loaded import Actor
-from prefrl.policies.rollout import Act, step_rewards
+from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
-Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN"]
+Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN", "QRDQN"]
 
 
 class Algorithm(NamedTuple):
@@ -43,6 +47,13 @@ class Algorithm(NamedTuple):
     actions: Literal["any", "box", "discrete"] = "box"
     batch: int = 0
     """The default `batch_size` of one that learns from rollouts."""
+    draws: bool = True
+    """Whether its policy draws actions. Where it does not, first questions are about random actions."""
+
+    @property
+    def explores(self) -> bool:
+        """Whether it has what `explore` needs: an actor that explores, a critic to put back, and a replay buffer."""
+        return self.replays and self.actions == "box"
 
 
 ALGORITHMS: dict[Name, Algorithm] = {
@@ -50,19 +61,19 @@ ALGORITHMS: dict[Name, Algorithm] = {
     "A2C": Algorithm("stable_baselines3", 5, replays=False, actions="any"),
     "TRPO": Algorithm("sb3_contrib", 2048, replays=False, actions="any", batch=128),
     "SAC": Algorithm("stable_baselines3", 1),
-    "TD3": Algorithm("stable_baselines3", 1),
-    "DDPG": Algorithm("stable_baselines3", 1),
+    "TD3": Algorithm("stable_baselines3", 1, draws=False),
+    "DDPG": Algorithm("stable_baselines3", 1, draws=False),
     "TQC": Algorithm("sb3_contrib", 1),
     "CrossQ": Algorithm("sb3_contrib", 1),
-    "DQN": Algorithm("stable_baselines3", 4, actions="discrete"),
+    "DQN": Algorithm("stable_baselines3", 4, actions="discrete", draws=False),
+    "QRDQN": Algorithm("sb3_contrib", 4, actions="discrete", draws=False),
 }
 OF_TASK = {"any": "any actions", "box": "continuous actions", "discrete": "discrete actions"}
 BATCH = 64
 """Steps that a trial run takes in all."""
 DISCOUNT = 0.99
 """The default `gamma` of its algorithms."""
-COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")
-REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate")
 
 
 class SB3Settings(Settings):
@@ -70,11 +81,18 @@ class SB3Settings(Settings):
 
     kind: Literal["sb3"] = "sb3"
     algorithm: Name = "PPO"
-    """Which one; DQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the others for both."""
+    """Which one; DQN and QRDQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the others for
+    both."""
     environments: int = Field(8, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
     """Environment steps of one round's learning: a multiple of what the algorithm collects between two updates."""
+    explore_steps: int = Field(0, ge=0)
+    """Environment steps before the first question, in which an algorithm with an actor and a replay buffer looks for
+    states unlike those it has seen (PEBBLE); the first questions are about what it did then."""
+    rollback: float | None = Field(None, ge=0)
+    """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
+    one (0.1, say); null keeps whatever comes, and no best policy beside the last one."""
     options: dict[str, JsonValue] = Field(default_factory=dict)
     """Arguments of the algorithm (learning_rate, gamma, batch_size, ...), as its own documentation names them."""
     policy: dict[str, JsonValue] = Field(default_factory=dict)
@@ -86,9 +104,20 @@ class SB3Settings(Settings):
     threads: int | None = Field(1, ge=1)
     """With how many threads torch and BLAS compute: more make small networks slower; null leaves it to them."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, given: Any) -> Any:
+        if isinstance(given, dict) and given.get("algorithm") == "RecurrentPPO":
+            raise ValueError(
+                "algorithm=RecurrentPPO is not supported: its memory goes from step to step, and evaluations, "
+                "load_policy and segments of other policies here act on one observation at a time; show a policy "
+                "without memory the last few at once with task.stack=4"
+            )
+        return given
+
     def shrunk(self) -> SB3Settings:
         """One rollout of a batch in each environment; with a replay buffer about as many, learning from the first."""
-        if self.steps_per_round % (self.at_once * self.environments):
+        if self.steps_per_round % self.unit or self.explore_steps % self.unit:
             return self  # building it says what is wrong
         options: dict[str, Any] = dict(self.options)
         known = ALGORITHMS[self.algorithm]
@@ -98,7 +127,8 @@ class SB3Settings(Settings):
             options["learning_starts"] = 0  # else a trial run would end before the first gradient step
             each = min(self.steps_per_round // self.environments, self.at_once * max(1, BATCH // self.at_once))
         steps = each * self.environments
-        return self.model_copy(update={"options": options, "steps_per_round": steps, "evaluation_episodes": 1})
+        update = {"options": options, "steps_per_round": steps, "evaluation_episodes": 1, "explore_steps": 0}
+        return self.model_copy(update=update)
 
     def with_evaluation_of(self, other: SB3Settings) -> SB3Settings:
         return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
@@ -121,6 +151,11 @@ class SB3Settings(Settings):
             return int(options.get("train_freq", known.at_once))
         return int(options.get("n_steps", min(known.at_once, max(self.steps_per_round // self.environments, 1))))
 
+    @property
+    def unit(self) -> int:
+        """Steps that the algorithm collects at once, in all environments."""
+        return self.at_once * self.environments
+
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
         found = control(task, f"learner kind {self.kind!r} acts in control tasks")
@@ -130,6 +165,12 @@ class SB3Settings(Settings):
             raise ConfigError(
                 f"learner.algorithm={self.algorithm} needs {OF_TASK[wanted]}, and {found.name} has {OF_TASK[here]}; "
                 f"use one of {', '.join(fitting)}"
+            )
+        if self.explore_steps and not ALGORITHMS[self.algorithm].explores:
+            fitting = [name for name, known in ALGORITHMS.items() if known.explores]
+            raise ConfigError(
+                f"learner.explore_steps={self.explore_steps} needs an actor and a replay buffer: "
+                f"{', '.join(fitting)}; {self.algorithm} has not both, leave it at 0"
             )
         return SB3(self, found, rng)
 
@@ -147,10 +188,11 @@ class SB3:
     """
 
     def __init__(self, settings: SB3Settings, task: ControlTask, rng: np.random.Generator) -> None:
-        self._settings, self._replays = settings, ALGORITHMS[settings.algorithm].replays
+        self._settings, self._known = settings, ALGORITHMS[settings.algorithm]
         self._player = Player(task, settings.environments)
         self._env = TaskEnv(task, settings.environments)
         self._learned = LearnedReward(self._env, None)
+        self._end = 0.0
         with seeded(rng):
             self.model = _algorithm(settings, self._learned)
         _check_steps(settings)
@@ -160,25 +202,26 @@ class SB3:
         return self._player.steps
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
-        """Segments of the last round; before the first round, of the starting policy (query steps)."""
+        """Segments of the last round; before the first round, of exploring, or of the starting policy (query steps)."""
+        if self._settings.explore_steps and not self._player.moved:
+            with self._learning(rng):
+                explore(self.model, self._learned, self._settings.explore_steps, self._settings.unit)
+            self._player.explored(self._taken(rng))
         # Only the first round acts here; later ones cut what was done already.
         with nullcontext() if self._player.rounds else seeded(rng):
-            return self._player.sample(count, self._act(deterministic=False), rng)
+            act = self._act(deterministic=False) if self._known.draws else self._random(rng)
+            return self._player.sample(count, act, rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """`steps_per_round` environment steps of learning, from fresh episodes, after relabelling what is replayed."""
         self._learned.learned = step_rewards(reward)
         # Before learning: the buffer holds what the reward model said before its last fit.
-        if self._replays:
+        if self._known.replays:
             relabel(self.model.replay_buffer, step_rewards(reward))
-        self._env.start(rng)
-        self.model._last_obs = None  # makes learn() reset the environments
-        with seeded(rng):
-            self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
-            self.model.learn(self._settings.steps_per_round, reset_num_timesteps=False, log_interval=None)
-        # Taken before the second start, which forgets it and so frees the memory.
-        self._player.learned_from(self._env.rollout())
-        self._env.start(rng)
+        steps = self._settings.steps_per_round
+        with self._learning(rng):
+            self.model.learn(steps, self._paced(steps), reset_num_timesteps=False, log_interval=None)
+        self._player.learned_from(self._taken(rng))
         values = self.model.logger.name_to_value
         return {k.removeprefix("train/"): float(v) for k, v in values.items() if k.startswith("train/")}
 
@@ -186,6 +229,27 @@ class SB3:
         """The policy's mode in fresh environments."""
         act = self._act(deterministic=True)
         return self._player.evaluate(self._settings.evaluation_episodes, act, reward, rng)
+
+    def settle(self, reward: RewardModel[Segment]) -> Evaluation[Segment] | None:
+        """Go back to the best policy, by the newest reward, where the last round lost clearly (`Best.settle`).
+
+        Networks and optimisers go back; what is replayed stays, and so does the learning rate, which is the options'.
+        """
+        if self._settings.rollback is None:
+            return None
+        undone = self._player.settle(deepcopy(self._networks()), reward, self._settings.rollback)
+        if undone is not None:
+            self.go_back()
+        return undone
+
+    def go_back(self) -> int:
+        best = self._player.best
+        if best.weights is not None:
+            self._load_networks(deepcopy(best.weights))  # a copy: optimisers go on writing into what they are given
+        return best.round if best.weights is not None else self._player.rounds
+
+    def pace(self, begin: float, end: float) -> None:
+        self._end = end
 
     def actor(self) -> Actor:
         return lambda observations, rng: self._act(deterministic=rng is None)(observations, None)[1]
@@ -195,25 +259,74 @@ class SB3:
         self.model.save(path)
 
     def state(self) -> State:
-        names, variables = self.model._get_torch_save_params()
         counters = {name: getattr(self.model, name) for name in COUNTERS if hasattr(self.model, name)}
+        replay = replay_state(self.model.replay_buffer) if self._known.replays else None
+        return self._networks() | {"counters": counters, "replay": replay} | self._player.state()
+
+    def load(self, state: State) -> None:
+        self._load_networks(state)
+        for name, value in state["counters"].items():
+            setattr(self.model, name, value)
+        if self._known.replays:
+            load_replay(self.model.replay_buffer, state["replay"])
+        self._player.load(state)
+
+    def _networks(self) -> State:
+        """Networks, optimisers and what else is learned."""
+        names, variables = self.model._get_torch_save_params()
         return {
             "modules": {name: _attribute(self.model, name).state_dict() for name in names},
             "variables": {name: getattr(self.model, name).detach().clone() for name in variables},
-            "counters": counters,
-            "replay": _replay_state(self.model.replay_buffer) if self._replays else None,
-        } | self._player.state()
+        }
 
-    def load(self, state: State) -> None:
+    def _load_networks(self, state: State) -> None:
         for name, values in state["modules"].items():
             _attribute(self.model, name).load_state_dict(values)
         for name, value in state["variables"].items():
             getattr(self.model, name).data.copy_(value)
-        for name, value in state["counters"].items():
-            setattr(self.model, name, value)
-        if self._replays:
-            _load_replay(self.model.replay_buffer, state["replay"])
-        self._player.load(state)
+
+    @contextmanager
+    def _learning(self, rng: np.random.Generator) -> Iterator[None]:
+        """What the algorithm learns in starts with fresh episodes, and is drawn from `rng`."""
+        self._env.start(rng)
+        self.model._last_obs = None  # makes learn() reset the environments
+        with seeded(rng):
+            self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
+            yield
+        if self._known.replays:
+            cut(self.model.replay_buffer)
+
+    def _taken(self, rng: np.random.Generator) -> Rollout:
+        """What was done in it."""
+        # Taken before the second start, which forgets it and so frees the memory.
+        rollout = self._env.rollout()
+        self._env.start(rng)
+        return rollout
+
+    def _paced(self, steps: int) -> Callable[[object, object], bool]:
+        """A callback that spreads schedules (the exploration of DQN) over the run, where each call of learn() would
+        begin them anew."""
+        total = round((self.model.num_timesteps + steps) / self._end) if self._end else None
+
+        def spread(*_: object) -> bool:
+            if total is not None:
+                self.model._total_timesteps = total
+            return True
+
+        return spread
+
+    def _random(self, rng: np.random.Generator) -> Act:
+        space = self.model.action_space
+
+        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+            if self._env.discrete:
+                chosen: np.ndarray = rng.integers(space.n, size=len(observations))
+            else:
+                chosen = rng.uniform(space.low, space.high, (len(observations), *space.shape))
+            actions = executed(space, chosen)
+            return actions, actions
+
+        return act
 
     def _act(self, deterministic: bool) -> Act:
         def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
@@ -265,34 +378,18 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
 
 def _check_steps(settings: SB3Settings) -> None:
     """The algorithms overshoot a budget that is no multiple of what they collect at once."""
-    at_once = settings.at_once
-    unit = at_once * settings.environments
-    if settings.steps_per_round % unit:
-        raise ConfigError(
-            f"learner.steps_per_round must be a multiple of {unit} ({settings.algorithm} collects {at_once} steps in "
-            f"each of {settings.environments} environments at once), got {settings.steps_per_round}"
-        )
+    for name, steps in (("steps_per_round", settings.steps_per_round), ("explore_steps", settings.explore_steps)):
+        if steps % settings.unit:
+            raise ConfigError(
+                f"learner.{name} must be a multiple of {settings.unit} ({settings.algorithm} collects "
+                f"{settings.at_once} steps in each of {settings.environments} environments at once), got {steps}"
+            )
 
 
 def _attribute(model: Any, dotted: str) -> Any:
     for name in dotted.split("."):
         model = getattr(model, name)
     return model
-
-
-def _replay_state(buffer: ReplayBuffer) -> State:
-    size = buffer.size()
-    # What is filled, not what is allocated: a buffer may have room for a million steps.
-    return {name: getattr(buffer, name)[:size].copy() for name in REPLAY} | {"pos": buffer.pos, "full": buffer.full}
-
-
-def _load_replay(buffer: ReplayBuffer, state: State) -> None:
-    for name in REPLAY:
-        values = state[name]
-        if values.shape[0] > buffer.buffer_size or values.shape[1:] != getattr(buffer, name).shape[1:]:
-            raise ValueError(f"replay: {name} has shape {values.shape}, which this buffer cannot hold: other settings")
-        getattr(buffer, name)[: len(values)] = values
-    buffer.pos, buffer.full = state["pos"], state["full"]
 
 
 __all__: Sequence[str] = ("SB3", "LearnedReward", "SB3Settings", "TaskEnv", "executed", "relabel", "seeded")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from prefrl.policies.rollout import Rollout
-from prefrl.protocols import ControlTask, StepRewardModel, Transition
+from prefrl.protocols import ControlTask, StepRewards, Transition
 from prefrl.types import Floats
 
 
@@ -85,23 +84,27 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
         return [False] * self.num_envs
 
 
+Seen: TypeAlias = Floats | dict[str, np.ndarray]
+"""(n, ...) observations, or a dict of such arrays."""
+
+
 class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
     """Any `VecEnv` with a reward model's rewards in place of its own, which are dropped.
 
-    Put it inside of whatever normalises observations: a reward model sees them raw. Swap `learned` after a fit; with
-    a replay buffer, `relabel` it too. A reward that looks back sees the steps of the running episode. Raises
-    FloatingPointError where a reward is not finite.
+    Put it inside of whatever normalises observations: a reward model sees them raw, as rows of numbers. Swap `learned`
+    after a fit; with a replay buffer, `relabel` it too. A reward that looks back sees the steps of the running episode.
+    Raises FloatingPointError where a reward is not finite.
     """
 
-    def __init__(self, venv: VecEnv, reward: StepRewardModel | None) -> None:
+    def __init__(self, venv: VecEnv, reward: StepRewards | None) -> None:
         super().__init__(venv)
         self.learned = reward
-        self._observations: Floats = np.zeros(0)
+        self._observations: Seen = np.zeros(0)
         self._actions: Floats = np.zeros(0)
         self._recent: list[tuple[Floats, Floats, np.ndarray]] = []
         self._begins = np.ones(venv.num_envs, bool)
 
-    def reset(self) -> Floats:
+    def reset(self) -> Seen:
         self._observations = self.venv.reset()
         self._recent, self._begins = [], np.ones(self.num_envs, bool)
         return self._observations
@@ -110,52 +113,27 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
         self._actions = executed(self.action_space, actions)
         self.venv.step_async(actions)
 
-    def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Seen, Floats, np.ndarray, list[dict[str, Any]]]:
         observations, _, dones, infos = self.venv.step_wait()
         # The observation that the action was chosen on, not the one it led to.
-        self._recent.append((self._observations.reshape(self.num_envs, -1), self._actions, self._begins))
+        self._recent.append((flattened(self.observation_space, self._observations), self._actions, self._begins))
         self._recent = self._recent[-(1 if self.learned is None else self.learned.memory) :]
         # (n, up to memory, .) steps -> (n,): the reward of the newest of them.
-        rewards = _score(self.learned, *(np.stack(part, 1) for part in zip(*self._recent, strict=True)))[:, -1]
+        rewards = scored(self.learned, *(np.stack(part, 1) for part in zip(*self._recent, strict=True)))[:, -1]
         # A VecEnv resets at once, so what follows a done is the first observation of an episode.
         self._observations, self._begins = observations, dones
         return observations, rewards, dones, infos
 
 
-def relabel(buffer: ReplayBuffer, reward: StepRewardModel) -> None:
-    """Recompute every reward of a replay buffer (Lee et al. 2021, PEBBLE, section 4.2), in place.
-
-    A reward that looks back sees what the buffer still holds of its episode. Raises ValueError for buffers that keep
-    something else than one transition a slot.
-    """
-    # Not isinstance: subclasses keep sums over several steps, goals, or dicts.
-    if type(buffer) is not ReplayBuffer:
-        raise ValueError(f"relabel needs stable-baselines3's plain ReplayBuffer, got {type(buffer).__name__}")
-    size, space = buffer.size(), buffer.action_space
-    if size == 0:
-        return
-    actions = buffer.actions[:size]
-    if isinstance(space, gymnasium.spaces.Box):  # the buffer keeps actions scaled to [-1, 1]
-        actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
-    flat = executed(space, actions.reshape(size * buffer.n_envs, -1)).reshape(size, buffer.n_envs, -1)
-    observations = buffer.observations[:size].reshape(size, buffer.n_envs, -1)
-    # In a full ring the next slot to be overwritten is the oldest.
-    oldest_first = np.roll(np.arange(size), -buffer.pos if buffer.full else 0)
-    # (size, n, .) -> (n, size, .): a row for each environment, as a reward model has it.
-    parts = (x[oldest_first].swapaxes(0, 1) for x in (observations, flat, _begins(buffer, size)))
-    buffer.rewards[oldest_first] = _score(reward, *parts).T
-
-
-def _begins(buffer: ReplayBuffer, size: int) -> np.ndarray:
-    """(size, n) bool: whether a slot does not go on from the one before it, because of an end or of a reset."""
-    ends = buffer.dones[:size] > 0
-    if not buffer.optimize_memory_usage:  # which would hold no other next observation than the next slot's
-        resets = buffer.next_observations[:size] != np.roll(buffer.observations[:size], -1, 0)
-        # A reset from outside, between two calls of learn(), leaves no done behind, but the observations do not join.
-        ends = ends | resets.reshape(size, buffer.n_envs, -1).any(2)
-    begins: np.ndarray = np.roll(ends, 1, 0)
-    begins[buffer.pos % size if buffer.full else 0] = True  # what came before the oldest slot is gone
-    return begins
+def flattened(space: gymnasium.Space[Any], observations: Seen) -> Floats:
+    """(N, O) float32 rows of N observations, in gymnasium's order: a dict's parts by name, a choice one-hot."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        assert isinstance(observations, dict)
+        return np.concatenate([flattened(part, observations[name]) for name, part in space.spaces.items()], 1)
+    assert not isinstance(observations, dict)
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return executed(space, observations)
+    return np.asarray(observations, np.float32).reshape(len(observations), -1)
 
 
 def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
@@ -180,7 +158,7 @@ def _infos(step: Transition) -> list[dict[str, Any]]:
     return infos
 
 
-def _score(reward: StepRewardModel | None, observations: Floats, actions: Floats, begins: np.ndarray) -> Floats:
+def scored(reward: StepRewards | None, observations: Floats, actions: Floats, begins: np.ndarray) -> Floats:
     """(n, T) float32 rewards of T steps of n environments."""
     if reward is None:
         raise ValueError("LearnedReward has no reward model yet: set its `learned`")

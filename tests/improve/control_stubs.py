@@ -108,6 +108,24 @@ class Known:
     def load(self, state: State) -> None: ...
 
 
+def _ages(observations: Floats, actions: Floats, begins: np.ndarray | None) -> Floats:
+    """For each step, how many steps of its episode can be seen, itself counted."""
+    seen: Floats = np.zeros(observations.shape[:2])
+    for t in range(observations.shape[1]):
+        before = seen[:, t - 1] if t else 0
+        seen[:, t] = 1 + (before if begins is None else np.where(begins[:, t], 0, before))
+    return seen
+
+
+class Ageing:
+    """A reward model that looks back over `memory` steps, and pays for how many it sees."""
+
+    fitted, members, memory = True, 1, 4
+
+    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
+        return np.minimum(_ages(observations, actions, begins), self.memory).astype(np.float32)
+
+
 def point(discrete: bool = False, spent: list[int] | None = None, hide_gold: bool = False) -> GymnasiumTask:
     """The task; `spent` grows by the number of environments with each step."""
     kept: list[int] = [] if spent is None else spent

@@ -10,7 +10,7 @@ import pytest
 import torch
 from control_stubs import Known, Point, Watched, point
 
-from prefrl import Config
+from prefrl import Config, stages
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.loop import Loop
@@ -137,11 +137,21 @@ def test_the_best_policy_of_a_run_can_be_evaluated_beside_the_last_one(tmp_path:
     assert best.metrics["learned"] >= last.metrics["learned"]
 
 
-def test_a_learner_that_keeps_none_has_no_best_policy(tmp_path: Path) -> None:
-    config = shrink(Config.load("control/toy", ["learner.kind=sb3", "learner.steps_per_round=128"]))
+def test_stable_baselines3_has_a_best_policy_too(tmp_path: Path) -> None:
+    changes = ["learner.kind=sb3", "learner.steps_per_round=128", "learner.rollback=0.1"]
+    config = shrink(Config.load("control/toy", changes))
     with Run(config, tmp_path / "run") as run:
         list(run)
-    with pytest.raises(RunError, match=r"learner \(SB3\) keeps no best policy"):
+    best, of = evaluate(tmp_path / "run", best=True)
+    assert of in (0, 1)
+    assert best.metrics["learned"] >= evaluate(tmp_path / "run")[0].metrics["learned"]
+
+
+def test_a_learner_that_keeps_none_has_no_best_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Run(shrink(Config.load("control/toy")), tmp_path / "run") as run:
+        list(run)
+    monkeypatch.setattr(stages, "Settles", bytes)  # which no learner is
+    with pytest.raises(RunError, match=r"learner \(ControlLearner\) keeps no best policy"):
         evaluate(tmp_path / "run", best=True)
 
 

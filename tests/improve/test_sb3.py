@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from inspect import signature
 from typing import Any
 
@@ -9,18 +10,19 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from control_stubs import Known, point
+from control_stubs import Ageing, Known, point
 from corridor import corridor
 from stable_baselines3 import PPO as SB3PPO
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.improve import sb3
+from prefrl.improve.replay import replay_state
 from prefrl.improve.sb3 import (
     ALGORITHMS,
     SB3,
@@ -37,7 +39,7 @@ from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
-from prefrl.types import Floats, Segment, Steps
+from prefrl.types import Segment, Steps
 
 NET = {"net_arch": [8]}
 PPO: dict[str, Any] = {"algorithm": "PPO", "options": {"n_steps": 20, "n_epochs": 2, "batch_size": 40}}
@@ -47,6 +49,7 @@ SAC_: dict[str, Any] = {
 }
 both = pytest.mark.parametrize("algorithm", [PPO, SAC_], ids=["PPO", "SAC"])
 REPLAYS: dict[str, Any] = {"train_freq": 5, "gradient_steps": 2, "learning_starts": 20, "batch_size": 16}
+UNIT = gymnasium.spaces.Box(-1.0, 1.0, (1,))
 every = pytest.mark.parametrize("name", ALGORITHMS)
 
 
@@ -209,25 +212,6 @@ def test_an_evaluation_does_not_explore(algorithm: dict[str, Any]) -> None:
     assert [s.id for s in one.examples] == [s.id for s in other.examples]
 
 
-def test_relabelling_sees_actions_as_they_were_executed() -> None:
-    space = gymnasium.spaces.Box(np.array([-2.0], np.float32), np.array([6.0], np.float32))
-    buffer = ReplayBuffer(6, gymnasium.spaces.Box(-1.0, 1.0, (1,)), space, n_envs=2)
-    step = np.zeros((2, 1), np.float32)
-    buffer.add(step, step, np.array([[-1.0], [0.5]], np.float32), np.zeros(2), np.zeros(2), [{}, {}])
-    relabel(buffer, Known(lambda o, a: a[..., 0]))
-    assert buffer.rewards[:1].tolist() == [[-2.0, 4.0]]
-    assert not buffer.rewards[1:].any()
-
-
-def test_a_buffer_that_keeps_more_than_transitions_is_refused() -> None:
-    class Other(ReplayBuffer):  # type: ignore[misc]
-        pass
-
-    box = gymnasium.spaces.Box(-1.0, 1.0, (1,))
-    with pytest.raises(ValueError, match="plain ReplayBuffer, got Other"):
-        relabel(Other(4, box, box), Known())
-
-
 def test_the_wrapper_works_in_a_script_of_ones_own() -> None:
     task = ControlSettings(env="CartPole-v1", segment_steps=10).build()
     reward = MLPSettings(hidden=(8,)).build(task, np.random.default_rng(0))
@@ -240,7 +224,7 @@ def test_the_wrapper_works_in_a_script_of_ones_own() -> None:
 
 def test_the_wrapper_scores_the_observation_before_the_action() -> None:
     env = LearnedReward(make_vec_env("Pendulum-v1", 2, seed=0), Known(lambda o, a: o[..., 2] + 100 * a[..., 0]))
-    observations = env.reset()
+    observations: Any = env.reset()
     actions = np.array([[0.5], [9.0]], np.float32)
     _, rewards, _, _ = env.step(actions)
     np.testing.assert_allclose(rewards, observations[:, 2] + 100 * np.array([0.5, 2.0], np.float32), rtol=1e-5)
@@ -300,28 +284,10 @@ def test_the_algorithm_is_stable_baselines3s_own() -> None:
     assert isinstance(_learner(point(), SAC_).model, SAC)
 
 
-def _ages(observations: Floats, actions: Floats, begins: np.ndarray | None) -> Floats:
-    """For each step, how many steps of its episode can be seen, itself counted."""
-    seen: Floats = np.zeros(observations.shape[:2])
-    for t in range(observations.shape[1]):
-        before = seen[:, t - 1] if t else 0
-        seen[:, t] = 1 + (before if begins is None else np.where(begins[:, t], 0, before))
-    return seen
-
-
-class Ageing:
-    """A reward model that looks back over `memory` steps, and pays for how many it sees."""
-
-    fitted, members, memory = True, 1, 4
-
-    def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
-        return np.minimum(_ages(observations, actions, begins), self.memory).astype(np.float32)
-
-
 def test_the_wrapper_shows_a_reward_the_running_episode_as_far_back_as_it_looks() -> None:
     task = ControlSettings(env="Pendulum-v1", horizon=6, segment_steps=3).build()
     env, reward = LearnedReward(TaskEnv(task, 2), None), Ageing()
-    env.learned = reward  # type: ignore[assignment]
+    env.learned = reward
     env.reset()
     found = [env.step(np.zeros((2, 1), np.float32))[1].tolist() for _ in range(9)]
     assert found == [[float(min(t, 4))] * 2 for t in (1, 2, 3, 4, 5, 6, 1, 2, 3)]
@@ -340,18 +306,6 @@ def test_the_wrapper_gives_the_rewards_of_the_whole_rollout() -> None:
     np.testing.assert_allclose(found, learned_rewards(reward, inner.rollout()), rtol=1e-4, atol=1e-5)
 
 
-def test_relabelling_follows_the_ring_through_ends_and_resets() -> None:
-    box = gymnasium.spaces.Box(-1.0, 1.0, (1,))
-    buffer = ReplayBuffer(8, gymnasium.spaces.Box(-99.0, 99.0, (1,)), box, n_envs=1)
-    place = 0.0
-    for t in range(11):  # the ring is overwritten from its start; slot 2 then holds the newest step
-        observation, done = np.array([[place]], np.float32), t == 5
-        buffer.add(observation, observation + 1, np.zeros((1, 1)), np.zeros(1), np.array([done]), [{}])
-        place = 50.0 if t == 8 else place + 1  # a reset without an end, as between two rounds
-    relabel(buffer, Ageing())  # type: ignore[arg-type]
-    assert buffer.rewards[:, 0].tolist() == [3, 1, 2, 1, 2, 3, 1, 2]
-
-
 def test_an_algorithm_that_does_not_know_legal_moves_is_stopped_at_the_first_that_is_not() -> None:
     learner = _learner(corridor(), PPO)
     with pytest.raises(ValueError, match=r"is not legal there; .* learner.kind=control"):
@@ -365,3 +319,129 @@ def test_an_evaluation_plays_the_mode_whatever_the_global_generators_say(algorit
         torch.manual_seed(seed)
         gold.append(learner.evaluate(Known(), np.random.default_rng(0)).metrics)
     assert gold[0] == gold[1]
+
+
+def _all(learner: SB3, value: float) -> None:
+    """Make every weight this: 0 leaves the point where it is, and with 10 it is pushed away."""
+    with torch.no_grad():
+        for p in learner.model.policy.parameters():
+            p.fill_(value)
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC", "CrossQ"])
+def test_a_policy_that_lost_clearly_goes_back_and_what_is_replayed_stays(store: Store[Segment], name: Name) -> None:
+    learner, rng = _learner(_task(name), _settings(name), rollback=0.1), np.random.default_rng
+    learner.improve(Known(), store, rng(0))
+    _all(learner, 0.0)
+    learner.evaluate(Known(), rng(1))
+    assert learner.settle(Known()) is None
+    good, moments = _bytes(learner), deepcopy(_optimizer(learner).state_dict())
+    learner.improve(Known(), store, rng(2))
+    _all(learner, 10.0)
+    replayed = replay_state(learner.model.replay_buffer) if ALGORITHMS[name].replays else {}
+    learner.evaluate(Known(), rng(1))
+    undone = learner.settle(Known())
+    assert undone is not None
+    assert undone.notes[0].startswith("round 2 was undone")
+    assert _bytes(learner) == good
+    _assert_same(_optimizer(learner).state_dict()["state"], moments["state"])
+    assert learner.steps.learn == 160
+    if replayed:
+        assert learner.model.replay_buffer.size() == len(replayed["rewards"]) == 75
+    learner.improve(Known(), store, rng(3))  # which does not change the best policy that is kept
+    assert _bytes(learner) != good
+    assert learner.go_back() == 1
+    assert _bytes(learner) == good
+
+
+def _optimizer(learner: SB3) -> torch.optim.Optimizer:
+    critic = "critic.optimizer" in learner.model._get_torch_save_params()[0]
+    found: torch.optim.Optimizer = learner.model.critic.optimizer if critic else learner.model.policy.optimizer
+    return found
+
+
+def _assert_same(one: dict[int, Any], other: dict[int, Any]) -> None:
+    for number, moments in other.items():
+        assert all(torch.equal(one[number][name], x) for name, x in moments.items())
+
+
+def test_without_rollback_the_last_policy_stands(store: Store[Segment]) -> None:
+    learner = _learner(point(), SAC_)
+    for number in range(2):
+        learner.improve(Known(), store, np.random.default_rng(number))
+        if number:
+            _all(learner, 10.0)
+        learner.evaluate(Known(), np.random.default_rng(1))
+        assert learner.settle(Known()) is None
+    assert learner.go_back() == 2
+
+
+def test_exploration_falls_over_the_run_and_not_in_each_round_anew(store: Store[Segment], tmp_path: Any) -> None:
+    schedule = {"exploration_fraction": 1.0, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.2}
+    settings = {"algorithm": "DQN", "options": {**REPLAYS, **schedule}}
+    learner, rates = _learner(_task("DQN"), settings), []
+    for number in range(4):
+        learner.pace(number / 4, (number + 1) / 4)
+        learner.improve(Known(), store, np.random.default_rng(number))
+        rates.append(learner.model.exploration_rate)
+    assert rates == pytest.approx([0.8, 0.6, 0.4, 0.2])
+    other = _learner(_task("DQN"), settings)
+    save_state(tmp_path, "learner", learner.state())
+    other.load(load_state(tmp_path, "learner"))
+    assert other.model.exploration_rate == rates[-1]
+
+
+@pytest.mark.parametrize("name", ["DQN", "QRDQN", "TD3", "DDPG"])
+def test_where_a_policy_draws_nothing_first_questions_are_about_random_actions(name: Name) -> None:
+    pool = _learner(_task(name), _settings(name)).sample(20, np.random.default_rng(0))
+    actions = np.concatenate([s.actions for s in pool])
+    assert 0.3 < (actions[:, 0] > 0).mean() < 0.7
+    again = _learner(_task(name), _settings(name), seed=7).sample(20, np.random.default_rng(0))
+    assert [s.id for s in pool] == [s.id for s in again]
+
+
+def test_sums_over_several_steps_learn_in_the_loop_and_stop_where_a_round_ends(store: Store[Segment]) -> None:
+    learner = _learner(point(), {**SAC_, "options": {**SAC_["options"], "n_steps": 3}}, steps_per_round=60)
+    for number in range(2):
+        learner.improve(Known(), store, np.random.default_rng(number))
+    buffer = learner.model.replay_buffer
+    assert isinstance(buffer, NStepReplayBuffer)
+    # Episodes of 20 steps end at their time; a round of 30 ends in the middle of one.
+    assert np.flatnonzero(buffer.timeouts[:60, 0]).tolist() == [19, 29, 49, 59]
+    np.testing.assert_allclose(buffer.rewards[:60], 1 - 2 * np.abs(buffer.observations[:60, :, 0]), atol=1e-6)
+
+
+def test_a_policy_with_a_memory_is_refused_with_what_to_do() -> None:
+    with pytest.raises(ValueError, match=r"RecurrentPPO is not supported: .* task.stack=4"):
+        SB3Settings.model_validate({"algorithm": "RecurrentPPO"})
+
+
+class Parts(gymnasium.Env[dict[str, Any], Any]):
+    """A point on a line, seen in two parts."""
+
+    observation_space = gymnasium.spaces.Dict({"place": UNIT, "side": gymnasium.spaces.Discrete(2)})
+    action_space = UNIT
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Any]:
+        super().reset(seed=seed)
+        self.place, self.age = self.np_random.uniform(-1, 1, 1).astype(np.float32), 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        self.place, self.age = np.clip(self.place + 0.2 * action, -1, 1).astype(np.float32), self.age + 1
+        return self._seen(), float("nan"), False, self.age == 10, {}
+
+    def _seen(self) -> dict[str, Any]:
+        return {"place": self.place, "side": int(self.place[0] > 0)}
+
+
+def test_observations_in_parts_learn_in_a_script_of_ones_own() -> None:
+    worth = [Known(lambda o, a: o @ np.array([1.0, 10.0, 100.0])), Known(lambda o, a: -o[..., 0])]
+    env = LearnedReward(DummyVecEnv([Parts] * 2), worth[0])
+    model = SAC("MultiInputPolicy", env, buffer_size=30, learning_starts=10, batch_size=8, policy_kwargs=NET, seed=0)
+    model.learn(40)  # wraps the ring of 15 steps
+    buffer: Any = model.replay_buffer
+    place, side = buffer.observations["place"][..., 0], buffer.observations["side"][..., 0]
+    np.testing.assert_allclose(buffer.rewards, place + np.where(side > 0, 100.0, 10.0), rtol=1e-6)
+    relabel(buffer, worth[1])
+    np.testing.assert_allclose(buffer.rewards, -place)
