@@ -116,6 +116,7 @@ EXTRAS = {
     "uvicorn": "label",
     "pyarrow": "interchange",
     "minari": "interchange",
+    "onnx": "onnx",
 }
 
 

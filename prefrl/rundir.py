@@ -27,8 +27,8 @@ from prefrl.ranks import lead, rounds, shared
 from prefrl.report.examples import save_examples
 from prefrl.report.report import write_report
 from prefrl.seeding import streams
-from prefrl.storage.checkpoints import load_state, save_state
-from prefrl.storage.files import MANIFEST, DamagedError, verify, whole_folder, write_file
+from prefrl.storage.checkpoints import checkpoints, load_state, newest, save_state
+from prefrl.storage.files import DamagedError, verify, whole_folder, write_file
 from prefrl.store import Store
 from prefrl.types import Fitted, Json, Round
 
@@ -188,7 +188,7 @@ class Run:
             save_state(folder, "reward", self.loop.reward.state())
             write_file(folder / "config.yaml", self.config.dump().encode())
             write_file(folder / "loop.json", json.dumps({"round": number, "store": self.loop.sequence}).encode())
-        for old in _checkpoints(self.folder)[KEEP:]:  # only once the new one stands
+        for old in checkpoints(self.folder)[KEEP:]:  # only once the new one stands
             shutil.rmtree(old)
 
     def _restore(self) -> list[Json]:
@@ -198,7 +198,7 @@ class Run:
         """
         for unfinished in (self.folder / "checkpoints").glob(".round-*"):  # what a kill left of a checkpoint
             shutil.rmtree(unfinished)
-        if not _checkpoints(self.folder):
+        if not checkpoints(self.folder):
             return []
         folder, damaged = _newest(self.folder)
         self.notes += damaged
@@ -265,7 +265,7 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
     Where nothing has happened yet, because a start failed, new settings take the place of the old ones.
     """
     path = folder / "config.yaml"
-    begun = bool(_checkpoints(folder)) or store.sequence > 0
+    begun = bool(checkpoints(folder)) or store.sequence > 0
     found = Config.load(path) if path.exists() and begun else config
     if _lasting(found) != _lasting(config):
         difference = _difference(_lasting(found), _lasting(config))
@@ -297,25 +297,12 @@ def _flatten(tree: Json, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-def _checkpoints(folder: Path) -> list[Path]:
-    """Newest first."""
-    return sorted(folder.glob("checkpoints/round-*"), key=lambda p: int(p.name.removeprefix("round-")), reverse=True)
-
-
 def _newest(folder: Path) -> tuple[Path, list[str]]:
-    """The newest good checkpoint of a run (or the folder itself, if it is one), and what was wrong with newer ones."""
-    damaged = []
-    found = _checkpoints(folder) or [folder] * (folder / MANIFEST).exists()
-    if not found:
-        raise RunError(f"{folder} holds neither a run with a checkpoint nor a saved model")
-    for checkpoint in found:
-        try:
-            verify(checkpoint)
-        except DamagedError as error:
-            damaged.append(str(error))
-        else:
-            return checkpoint, damaged
-    raise RunError(f"{folder} holds no checkpoint that can be used: {'; '.join(damaged)}")
+    """The newest good checkpoint, and what was wrong with newer ones."""
+    try:
+        return newest(folder)
+    except DamagedError as error:
+        raise RunError(str(error)) from error
 
 
 def _events(folder: Path, round: int) -> Any:

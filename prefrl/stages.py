@@ -24,9 +24,11 @@ from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
 from prefrl.policies.loaded import Loaded
-from prefrl.protocols import Acts, Attended, Labeler, RewardModel, Settles, TextTask, text
+from prefrl.policies.zips import Zipped, read_zip
+from prefrl.protocols import Acts, Attended, ControlTask, Labeler, RewardModel, Settles, TextTask, control, text
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
+from prefrl.sample.graded import graded
 from prefrl.seeding import streams
 from prefrl.storage.checkpoints import load_state
 from prefrl.storage.files import check_free, read_lines, write_file
@@ -46,12 +48,14 @@ def label(
     policy: Saved | None = None,
     given: Path | None = None,
     tell: Tell = lambda _: None,
+    policies: Sequence[Path] = (),
 ) -> dict[str, int]:
     """Ask `loop.labels` queries in the store of a folder, and have the labeler answer them; returns the counts.
 
-    Candidates come from the starting policy, from a run's `policy`, or from a file of `given` responses. Calling it
-    again on the same folder goes on where it stopped, and asks more if `loop.labels` is higher. Raises `RunError` for
-    the folder of a run, whose labels are its own.
+    Candidates come from the starting policy, from a run's `policy`, from a file of `given` responses, or from
+    `policies` of control (`load_policy`), which every query then mixes; the selector is not asked. Calling it again on
+    the same folder goes on where it stopped, and asks more if `loop.labels` is higher. Raises `RunError` for the folder
+    of a run, whose labels are its own.
     """
     if (folder / "checkpoints").exists():
         raise RunError(f"{folder} holds a run, which asks for its own labels: choose another folder")
@@ -64,6 +68,15 @@ def label(
         asked = store.counts()["asked"]
         if given:
             store.ask(read_queries(given, loop.task))
+        elif policies:
+            queries = graded(
+                {str(path): load_policy(path) for path in policies},
+                control(loop.task, "--policy gives segments of control"),
+                loop.candidates,
+                config.loop.labels - asked,
+                streams(config.seed, 1 + asked).sample,
+            )
+            store.ask(queries)
         else:
             loop.ask(config.loop.labels - asked, streams(config.seed, 1 + asked))
         with attended(loop.labeler, store, tell):
@@ -274,13 +287,66 @@ def with_reward(config: Config, saved: Path) -> Config:
     return config.model_copy(update=update)
 
 
-def load_policy(folder: str | Path, best: bool = False) -> Loaded:
-    """The last policy of a run of control, or the best one by its newest reward; `predict` acts with it.
+def load_policy(path: str | Path, best: bool = False) -> Loaded:
+    """The last policy of a run of control, or the best one by its newest reward, or that of a zip of
+    stable-baselines3, of which weights alone are read (`prefrl.policies.zips`); `predict` acts with it.
 
-    Raises `RunError` for a run of text, and for the best one of a learner that keeps none.
+    Raises `RunError` for a run of text, for the best one of a learner that keeps none, and where nothing is there.
     """
-    learner, task, _ = _acting(Path(folder), best)
-    return Loaded(learner.actor(), task.observation_size, task.action_bounds is None)
+    if Path(path).is_file():
+        return _zipped(Path(path), best).loaded()
+    learner, task, _ = _acting(_there(Path(path)), best)
+    return Loaded(learner.actor(), task.observation_size, task.action_size, task.action_bounds is None)
+
+
+def _zipped(path: Path, best: bool) -> Zipped:
+    if best:
+        raise RunError(f"{path}: a zip holds one policy, and no best one beside it; leave --best out")
+    return read_zip(path)
+
+
+def _there(path: Path) -> Path:
+    if not path.exists():
+        raise RunError(f"there is no {path}: expected the folder of a run, or a zip of stable-baselines3")
+    return path
+
+
+def on_stage(path: Path, env: str | None, best: bool = False) -> tuple[Loaded, ControlTask]:
+    """A policy, as `load_policy` gives it, and where it acts: in its run's task, or in gymnasium's `env`.
+
+    Raises `RunError` for a zip without an `env`, which it does not name itself.
+    """
+    policy = load_policy(path, best)
+    if env is None and path.is_file():
+        raise RunError(f"{path} does not say which environment it is for: name it, as in --env Pendulum-v1")
+    task = open_saved(path).config.build_task() if env is None else Config.parse(_of_env(env)).build_task()
+    found = control(task, f"{path}: a policy of control is expected")
+    policy.check(found, str(path))
+    return policy, found
+
+
+def _of_env(env: str) -> Json:
+    return {"task": {"kind": "control", "env": env}, "reward": {"kind": "mlp"}, "learner": {"kind": "control"}}
+
+
+def export_onnx(path: Path, to: Path, best: bool = False) -> None:
+    """Write the mode of a policy of control as ONNX: that of a run with our own learner, or of a zip.
+
+    Raises `RunError` for others.
+    """
+    from prefrl.improve.control import ControlLearner
+    from prefrl.policies.to_onnx import save_onnx
+
+    if path.is_file():
+        save_onnx(_zipped(path, best).actor(), to)
+        return
+    learner, _, _ = _acting(_there(path), best)
+    if not isinstance(learner, ControlLearner):
+        raise RunError(
+            f"{path}: expected a run with learner.kind=control, and its policy is that of a {type(learner).__name__}; "
+            "export it with --form sb3, and from there as stable-baselines3's documentation says"
+        )
+    save_onnx(learner.policy.numpy_actor(), to)
 
 
 def export_sb3(folder: Path, to: Path, best: bool = False) -> int:

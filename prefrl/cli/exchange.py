@@ -43,6 +43,7 @@ class Form(StrEnum):
     policy = "policy"
     adapter = "adapter"
     sb3 = "sb3"
+    onnx = "onnx"
 
 
 class Ties(StrEnum):
@@ -67,7 +68,9 @@ class Rows(StrEnum):
 
 @commands.command("export")
 def export_(
-    store: Annotated[Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`.", exists=True)],
+    store: Annotated[
+        Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`; for onnx also a zip.", exists=True)
+    ],
     to: Annotated[Path, typer.Option(help="A folder for dataset, minari, bundle and models, else a file.")],
     form: Annotated[
         Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a model.")
@@ -75,7 +78,9 @@ def export_(
     ties: Annotated[Ties, typer.Option(help="In the columns of TRL: leave ties out, or write them both ways.")] = (
         Ties.drop
     ),
-    best: Annotated[bool, typer.Option("--best", help="With sb3: the best policy, in place of the last one.")] = False,
+    best: Annotated[
+        bool, typer.Option("--best", help="With sb3 and onnx: the best policy, in place of the last one.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
     """Write judgements, a reward model of text or a policy to files, and say what these could not hold."""
@@ -100,6 +105,12 @@ def export_(
 
         round = export_sb3(store, to, best)
         say(f"{to}: the policy after round {round}; stable-baselines3 loads it, and it acts on raw observations")
+        return
+    if form is Form.onnx:
+        from prefrl.stages import export_onnx
+
+        export_onnx(store, to, best)
+        say(f"{to}: raw observations (n, O) in, actions out: the policy's mode")
         return
     from prefrl.exchange.ports import export
     from prefrl.store import Store

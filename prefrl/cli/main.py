@@ -15,6 +15,7 @@ import typer
 
 from prefrl.cli.exchange import Labelers, Out, Split
 from prefrl.cli.exchange import commands as exchange_commands
+from prefrl.cli.film import commands as film_commands
 from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
 
@@ -32,6 +33,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.add_typer(exchange_commands)
+app.add_typer(film_commands)
 app.add_typer(store_commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
@@ -101,6 +103,10 @@ def label(
     given: Annotated[
         Path | None, typer.Option(help='JSON lines {"prompt", "responses"} to ask about.', exists=True)
     ] = None,
+    policies: Annotated[
+        list[Path] | None,
+        typer.Option("--policy", help="A run of control or a zip whose segments are asked about; say it for each one."),
+    ] = None,
     terminal: Annotated[bool, typer.Option(help="Short for labeler.kind=terminal.")] = False,
     serve: Annotated[
         bool, typer.Option(help="Short for labeler.kind=web; of a folder with a store, its open queries are answered.")
@@ -117,8 +123,9 @@ def label(
     there = serve and has_store(Path(source))
     _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
     _refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
-    own = there and (out is not None or given is not None)
-    _refuse(own, f"{source} has queries of its own: --out and --given are for new ones")
+    own = there and (out is not None or given is not None or bool(policies))
+    _refuse(own, f"{source} has queries of its own: --out, --given and --policy are for new ones")
+    _refuse(bool(policies) and given is not None, "--policy and --given are two sources of candidates: choose one")
     folder = Path(source) if there else out or Path("labels")
     extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(folder / 'clips'))}"] if terminal else []
     if serve:
@@ -131,7 +138,7 @@ def label(
         if there:
             stages.serve(folder, settings, say)
         else:
-            stages.label(_load(path, settings), folder, policy, given, say)
+            stages.label(_load(path, settings), folder, policy, given, say, policies or ())
     except KeyboardInterrupt:
         say(f"stopped; what was answered is in {folder}. Go on with the same command")
         raise

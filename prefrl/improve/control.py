@@ -26,6 +26,7 @@ from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
 from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
 from prefrl.seeding import Device, device_of
@@ -87,6 +88,9 @@ class ControlLearnerSettings(Settings):
     """Widths of the hidden layers, of the policy and of the critic."""
     initial_std: float = Field(1.0, gt=0)
     """Of the actions' noise at the start, in units of half the action bounds."""
+    start: Path | None = None
+    """A run of control, or a zip of stable-baselines3, whose policy this one starts from, with its critic, its noise
+    and its normaliser; from the working directory where it is relative. It needs the same widths and spaces."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
     device: Device = "auto"
@@ -158,6 +162,8 @@ class ControlLearner:
         self.policy.to(device_of(settings.device))
         self._optimizer = adam_of(self.policy, settings.learning_rate)
         self._span = 0.0, 0.0
+        # Read when it is first needed: a run that goes on has a policy of its own, and what it began with may be gone.
+        self._start = settings.start
 
     @property
     def steps(self) -> Steps:
@@ -215,6 +221,7 @@ class ControlLearner:
         self._span = begin, end
 
     def actor(self) -> Actor:
+        self._begin()
         actor = self.policy.numpy_actor()
         return lambda observations, rng: actor(observations, rng)[1]
 
@@ -222,15 +229,24 @@ class ControlLearner:
         """As a zip of stable-baselines3's PPO, which acts as this policy does."""
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
+        self._begin()
         save_ppo(self.policy, self._task, self._settings.hidden, path)
 
     def state(self) -> State:
+        self._begin()
         return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()} | self._player.state()
 
     def load(self, state: State) -> None:
+        self._start = None
         self.policy.load(state["policy"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._player.load(state)
+
+    def _begin(self) -> None:
+        """Take over the policy that this one starts from, once."""
+        if self._start is not None:
+            self.policy.load(starting_state(self._start, self._task, self._settings.hidden))
+            self._start = None
 
     def _rollout_lengths(self) -> list[int]:
         each = self._settings.steps_per_round // self._settings.environments
@@ -322,6 +338,7 @@ class ControlLearner:
 
     def _act(self, rng: np.random.Generator | None) -> Act:
         """The policy's choices, drawn from `rng`, or its mode."""
+        self._begin()
         actor = self.policy.numpy_actor()
         return lambda observations, legal: actor(observations, rng, legal)
 

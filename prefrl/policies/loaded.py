@@ -9,7 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from prefrl.types import Floats
+from prefrl.components import ConfigError
+from prefrl.policies.rollout import Act
+from prefrl.protocols import ControlTask
+from prefrl.types import Bools, Floats
 
 Actor: TypeAlias = Callable[[Floats, np.random.Generator | None], Floats]
 """(n, O) observations -> (n, A) actions to execute: the policy's mode, or drawn where there is a generator."""
@@ -21,7 +24,27 @@ class Loaded:
 
     actor: Actor
     observation_size: int
+    action_size: int
     discrete: bool
+
+    def act(self, rng: np.random.Generator | None) -> Act:
+        """For rollouts: what is drawn from `rng`, or the policy's mode."""
+
+        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+            actions = self.actor(observations, rng)
+            return actions, actions
+
+        return act
+
+    def check(self, task: ControlTask, name: str) -> None:
+        """Raises `ConfigError` for a task of other spaces; `name` says whose policy this is."""
+        here = task.observation_size, task.action_size, task.action_bounds is None
+        if (self.observation_size, self.action_size, self.discrete) != here:
+            raise ConfigError(
+                f"{name}: expected a policy for {task.name}, with {_told(*here)}; this one has "
+                f"{_told(self.observation_size, self.action_size, self.discrete)}: take another policy, or the task "
+                "that it was made for"
+            )
 
     def predict(
         self,
@@ -46,6 +69,10 @@ class Loaded:
         actions = self.actor(rows, drawn)
         found = actions.argmax(1) if self.discrete else actions
         return (found[0] if np.ndim(observation) == 1 else found), None
+
+
+def _told(seen: int, acts: int, discrete: bool) -> str:
+    return f"observations of {seen} numbers and {acts} {'discrete actions' if discrete else 'numbers in an action'}"
 
 
 __all__ = ["Actor", "Loaded"]

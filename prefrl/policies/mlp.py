@@ -38,14 +38,19 @@ class ActionSpace:
 
     @classmethod
     def of(cls, task: ControlTask) -> ActionSpace:
-        if task.action_bounds is None:
-            return cls(task.action_size)
-        low, high = (np.asarray(b, np.float32) for b in task.action_bounds)
+        return cls.within(task.action_size, task.action_bounds)
+
+    @classmethod
+    def within(cls, size: int, bounds: tuple[Floats, Floats] | None) -> ActionSpace:
+        """Of actions of that size within low (A,) and high (A,), or discrete ones where there are no bounds."""
+        if bounds is None:
+            return cls(size)
+        low, high = (np.asarray(b, np.float32) for b in bounds)
         bounded = np.isfinite(low) & np.isfinite(high)
         middle = np.where(bounded, (low + high) / 2, 0).astype(np.float32)
         # What has no bounds has no scale either: there the choice is the action.
         half = np.where(bounded, (high - low) / 2, 1).astype(np.float32)
-        return cls(task.action_size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
+        return cls(size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
 
     @property
     def discrete(self) -> bool:
@@ -98,12 +103,16 @@ class NumpyActor:
     mean: Floats
     scale: Floats
     """(O,) of the normaliser: what is taken off, and what the rest is multiplied by."""
+    clip: float = CLIP
+    """Standard deviations."""
 
     def normalise(self, observations: Floats) -> Floats:
         """(..., O) -> (..., O) float32."""
         scaled = (observations - self.mean) * self.scale
         # A state far outside of what was seen would otherwise saturate the first layer.
-        return np.minimum(np.maximum(scaled, -CLIP, out=scaled), CLIP, out=scaled)  # np.clip, in half its time
+        return np.minimum(
+            np.maximum(scaled, -self.clip, out=scaled), self.clip, out=scaled
+        )  # np.clip, in half its time
 
     def __call__(
         self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
@@ -155,6 +164,8 @@ class MLPPolicy:
         self._flat = torch.nn.Parameter(torch.cat([p.flatten() for p in named.values()]))
         self.to(self.device)
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
+        self.raw = False
+        """Whether observations are seen as they are, for good: by a policy that learned without a normaliser."""
 
     @property
     def device(self) -> torch.device:
@@ -182,6 +193,8 @@ class MLPPolicy:
         they do not, when weights are random and are to see inputs of one size. Never between acting and learning: the
         probability ratio would not start at 1.
         """
+        if self.raw:
+            return
         mean, scale = self.mean, self._scale
         # In float64: float32 sums lose small changes over many rounds.
         new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
@@ -217,7 +230,7 @@ class MLPPolicy:
         weights = self._views(self._flat)
         std = None if weights.log_std is None else np.exp(weights.log_std)
         mean, scale = self.mean.astype(np.float32), self._scale.astype(np.float32)
-        return NumpyActor(self.space, weights.actor, std, mean, scale)
+        return NumpyActor(self.space, weights.actor, std, mean, scale, np.inf if self.raw else CLIP)
 
     def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
@@ -277,7 +290,8 @@ class MLPPolicy:
 
     def state(self) -> State:
         named = {name: p.detach().clone() for name, p in self.named().items()}
-        return {"parameters": named, "mean": self.mean, "variance": self.variance, "count": self.count}
+        found = {"parameters": named, "mean": self.mean, "variance": self.variance, "count": self.count}
+        return found | {"raw": True} if self.raw else found
 
     @torch.no_grad()
     def load(self, state: State) -> None:
@@ -288,6 +302,7 @@ class MLPPolicy:
                 raise ValueError(f"policy: {name} has shape {found}, expected {expected}: other settings or task")
             parameter.copy_(state["parameters"][name])  # in place: the optimiser holds this very memory
         self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
+        self.raw = state.get("raw", False)
 
     def named(self) -> dict[str, Tensor]:
         """Every weight by its name, as torch lays layers out, (out, in) and (out,): views of what learns."""

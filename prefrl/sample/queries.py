@@ -55,6 +55,25 @@ def _first_fit(pool: Sequence[C], members: Sequence[int], size: int) -> list[lis
     return found
 
 
+def across(pools: Sequence[Sequence[C]], size: int, count: int, rng: np.random.Generator) -> list[Query[C]]:
+    """At most `count` queries of `size` candidates, each of as many pools as can be, no candidate in two of them.
+
+    Of fewer pools than candidates some give two or more, which do not overlap. Sides are random.
+    """
+    left = [[pool[i] for i in rng.permutation(len(pool))] for pool in pools]
+    found: list[Query[C]] = []
+    while len(found) < count:
+        order, query = rng.permutation(len(pools)), list[C]()
+        for slot in range(size):
+            stock = left[order[slot % len(pools)]]
+            at = next((i for i, one in enumerate(stock) if not any(overlap(one, other) for other in query)), None)
+            if at is None:
+                return found
+            query.append(stock.pop(at))
+        found.append(Query(tuple(query)))
+    return found
+
+
 def proposals(pool: Sequence[C], size: int, times: int, rng: np.random.Generator) -> Integers:
     """(Q, K) distinct queries in random order; each candidate stands in about `times` of them."""
     drawn = np.concatenate([groups(pool, size, rng) for _ in range(times)])

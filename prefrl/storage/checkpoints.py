@@ -1,4 +1,4 @@
-"""States without pickle: nested dicts of arrays and plain values, as safetensors + JSON."""
+"""States without pickle: nested dicts of arrays and plain values, as safetensors + JSON; and a run's newest one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from prefrl.storage.files import DamagedError, write_file
+from prefrl.storage.files import MANIFEST, DamagedError, verify, write_file
 from prefrl.types import State
 
 
@@ -35,6 +35,30 @@ def load_state(folder: Path, name: str) -> State:
     if not isinstance(state, dict):
         raise DamagedError(f"{folder}/{name}.json: expected an object, got {type(state).__name__}")
     return state
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Those of a run, newest first."""
+    return sorted(folder.glob("checkpoints/round-*"), key=lambda p: int(p.name.removeprefix("round-")), reverse=True)
+
+
+def newest(folder: Path) -> tuple[Path, list[str]]:
+    """The newest good checkpoint of a run (or the folder itself, if it is one), and what was wrong with newer ones.
+
+    Raises `DamagedError` where there is none.
+    """
+    damaged = []
+    found = checkpoints(folder) or [folder] * (folder / MANIFEST).exists()
+    if not found:
+        raise DamagedError(f"{folder} holds neither a run with a checkpoint nor a saved model")
+    for checkpoint in found:
+        try:
+            verify(checkpoint)
+        except DamagedError as error:
+            damaged.append(str(error))
+        else:
+            return checkpoint, damaged
+    raise DamagedError(f"{folder} holds no checkpoint that can be used: {'; '.join(damaged)}")
 
 
 def _split(value: Any, path: str, tensors: dict[str, torch.Tensor]) -> Any:

@@ -36,7 +36,7 @@ def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 
 
 def test_the_commands_know_every_form() -> None:
-    assert {form.value for form in Form} == {*EXPORTS, "classifier", "policy", "adapter", "sb3"}
+    assert {form.value for form in Form} == {*EXPORTS, "classifier", "policy", "adapter", "sb3", "onnx"}
     assert {form.value for form in Rows} == {*FORMS, "auto"}
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from importlib.util import find_spec
@@ -61,9 +61,8 @@ def encode(frames: np.ndarray, fps: float, format: str) -> bytes:
     _check(frames, fps)
     if format in ("webp", "gif"):
         return _stills(frames, fps, format)
-    frames = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), "edge")
     try:
-        return _video(frames, Fraction(fps).limit_denominator(1000), format)
+        return _video([_even(frames)], Fraction(fps).limit_denominator(1000), format)
     except Exception as error:  # PyAV raises many kinds of its own, and may not be installed
         raise EncodingError(f"no {format} can be made ({error}); run: {INSTALL}") from error
 
@@ -78,6 +77,26 @@ def write_clip(path: Path, clips: Sequence[np.ndarray], fps: float) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encode(side_by_side(clips), fps, format))
     return path
+
+
+def write_film(path: Path, clips: Iterable[np.ndarray], fps: float) -> None:
+    """Write clips (T, H, W, 3) uint8 of one size, one after another, as one file, whose suffix says how: .mp4, .webm,
+    .webp or .gif.
+
+    As a video no more than one clip is held in memory. Raises `EncodingError` for other suffixes, and where PyAV is
+    wanted and not installed.
+    """
+    format, known = path.suffix.removeprefix("."), (*VIDEO, "webp", "gif")
+    if format not in known:
+        raise EncodingError(f"{path}: expected a name that ends in .{', .'.join(known)}")
+    if format in VIDEO and format not in formats():
+        raise EncodingError(f"{path}: a video needs PyAV; run: {INSTALL}, or write a .gif")
+    if format in VIDEO:
+        data = _video((_even(clip) for clip in clips), Fraction(fps).limit_denominator(1000), format)
+    else:
+        data = encode(np.concatenate(list(clips)), fps, format)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
 
 
 def side_by_side(clips: Sequence[np.ndarray]) -> np.ndarray:
@@ -113,7 +132,12 @@ def _check(frames: np.ndarray, fps: float) -> None:
         )
 
 
-def _video(frames: np.ndarray, rate: Fraction, format: str) -> bytes:
+def _even(frames: np.ndarray) -> np.ndarray:
+    return np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), "edge")
+
+
+def _video(clips: Iterable[np.ndarray], rate: Fraction, format: str) -> bytes:
+    """Clips of one size, one after another."""
     import av
 
     codec, options = VIDEO[format]
@@ -123,9 +147,12 @@ def _video(frames: np.ndarray, rate: Fraction, format: str) -> bytes:
         path = Path(folder) / f"clip.{format}"
         with av.open(str(path), "w", options=index_first) as container:
             stream = container.add_stream(codec, rate=rate, options={**options, "g": str(KEY_FRAMES)})
-            stream.height, stream.width, stream.pix_fmt = frames.shape[1], frames.shape[2], "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            stream.pix_fmt = "yuv420p"
+            for number, frames in enumerate(clips):
+                if number == 0:  # the codec opens with the first frame
+                    stream.height, stream.width = frames.shape[1:3]
+                for frame in frames:
+                    container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
             container.mux(stream.encode())
         return path.read_bytes()
 

@@ -1,0 +1,105 @@
+"""Which policy another one starts from: that of a run, or one of stable-baselines3."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+import yaml
+from torch import Tensor
+
+from prefrl.components import ConfigError, settings_class
+from prefrl.policies.mlp import ActionSpace
+from prefrl.policies.zips import Bounds, read_zip, state_of
+from prefrl.protocols import ControlTask, TaskSettings
+from prefrl.storage.checkpoints import load_state, newest
+from prefrl.types import State
+
+OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and PPO, A2C or TRPO"
+
+
+class _Found(NamedTuple):
+    state: State
+    bounds: Bounds | None
+
+
+def starting_state(path: Path, task: ControlTask, hidden: tuple[int, ...]) -> State:
+    """What `MLPPolicy.load` reads: the last policy of a run, or that of a zip (`read_zip`).
+
+    Raises `ConfigError` for a policy of other spaces or widths, and for what is no policy of control.
+    """
+    if not path.exists():
+        raise ConfigError(
+            f"learner.start: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip"
+        )
+    try:
+        found = _of_run(path) if path.is_dir() else _of_zip(path)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"learner.start: {error}") from error
+    _check(found, path, task, hidden)
+    return found.state
+
+
+def _of_zip(path: Path) -> _Found:
+    zipped = read_zip(path)
+    return _Found(zipped.state(), zipped.bounds)
+
+
+def _of_run(folder: Path) -> _Found:
+    checkpoint, _ = newest(folder)
+    state = load_state(checkpoint, "learner")
+    ours, theirs = state.get("policy", {}), state.get("modules", {}).get("policy", {})
+    if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
+        raise ConfigError(f"learner.start: {folder} holds no policy of control that can be taken over; expected {OURS}")
+    said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))["task"]
+    settings = settings_class("tasks", said["kind"]).model_validate(said)
+    task = cast(ControlTask, cast(TaskSettings, settings).build())
+    return _Found(ours if "mean" in ours else state_of(theirs, ActionSpace.of(task)), task.action_bounds)
+
+
+def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]) -> None:
+    parameters: Mapping[str, Tensor] = found.state["parameters"]
+    there = [_sizes(parameters, net) for net in ("actor", "critic")]
+    seen, acts = there[0][0], there[0][-1]
+    if (seen, acts) != (task.observation_size, task.action_size) or not _same(found.bounds, task.action_bounds):
+        here = _told(task.observation_size, task.action_size, task.action_bounds)
+        came = _told(seen, acts, found.bounds)
+        raise ConfigError(
+            f"learner.start: expected a policy for {task.name}, with {here}; {path} has one with {came}: start from "
+            "another one, or choose the task that it was made for"
+        )
+    widths = [tuple(sizes[1:-1]) for sizes in there]
+    if widths[0] != widths[1]:
+        raise ConfigError(
+            f"learner.start: expected an actor and a critic of the same widths, and those of {path} are "
+            f"{list(widths[0])} and {list(widths[1])}: train one with net_arch of equal pi and vf"
+        )
+    if widths[0] != tuple(hidden):
+        raise ConfigError(
+            f"learner.start: expected hidden layers of {list(hidden)}, and those of {path} are {list(widths[0])}: set "
+            f"learner.hidden={list(widths[0])}"
+        )
+
+
+def _sizes(parameters: Mapping[str, Tensor], net: str) -> list[int]:
+    """Of a network's layers, from the observation to what it gives."""
+    weights = [p for name, p in parameters.items() if name.startswith(net) and p.dim() == 2]
+    return [int(weights[0].shape[1]), *(int(p.shape[0]) for p in weights)]
+
+
+def _same(a: Bounds | None, b: Bounds | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return all(np.allclose(x, y, rtol=1e-6) for x, y in zip(a, b, strict=True))
+
+
+def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
+    kind = "discrete actions" if bounds is None else f"actions from {bounds[0].tolist()} to {bounds[1].tolist()}"
+    return f"observations of {seen} numbers and {acts} {kind}"
+
+
+__all__ = ["starting_state"]

@@ -1,0 +1,204 @@
+"""Policies of stable-baselines3, read from their zips without running anything that is in them.
+
+A zip's file `data` holds pickles, which are never read: whoever loads one runs the code in it. Weights are read by
+torch's own reader of weights alone. `data` is JSON, which says in words beside each pickle what it is (the type of a
+space, its bounds); that is read as text, and what cannot be made out is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from prefrl.policies.loaded import Loaded
+from prefrl.policies.mlp import CLIP, ActionSpace, NumpyActor
+from prefrl.seeding import to_host, to_numpy
+from prefrl.types import Floats, Json, State
+
+Bounds: TypeAlias = tuple[Floats, Floats]
+WANTED = "expected a zip of stable-baselines3's PPO, A2C or TRPO with an MlpPolicy"
+VERSION = "_stable_baselines3_version"
+OTHERS = "load it with stable-baselines3 in a script of your own"
+PICKLED = re.compile("vec_?norm", re.IGNORECASE)
+"""Names of files with the statistics of `VecNormalize`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Zipped:
+    """An actor and a critic of stable-baselines3, and by which statistics they see observations."""
+
+    weights: Mapping[str, Tensor]
+    """As stable-baselines3 names them."""
+    bounds: Bounds | None
+    """(low (A,), high (A,)), or None where actions are discrete."""
+    normaliser: State | None = None
+    """`mean` (O,), `variance` (O,) and `count`; None where observations are seen as they are."""
+
+    @property
+    def space(self) -> ActionSpace:
+        return ActionSpace.within(len(self.weights["action_net.bias"]), self.bounds)
+
+    @property
+    def observation_size(self) -> int:
+        return int(self.weights["mlp_extractor.policy_net.0.weight"].shape[1])
+
+    def state(self) -> State:
+        """What `MLPPolicy.load` reads."""
+        return state_of(self.weights, self.space) | (self.normaliser or {})
+
+    def actor(self) -> NumpyActor:
+        state = self.state()
+        named = {name: to_numpy(p) for name, p in state["parameters"].items()}
+        count = sum(name.startswith("actor") for name in named) // 2
+        layers = [
+            (np.ascontiguousarray(named[f"actor_{2 * i}"].T), named[f"actor_{2 * i + 1}"][None]) for i in range(count)
+        ]
+        std = None if self.bounds is None else np.exp(named["log_std"])
+        mean, scale = (x.astype(np.float32) for x in (state["mean"], 1.0 / np.sqrt(state["variance"] + 1e-8)))
+        return NumpyActor(self.space, layers, std, mean, scale, np.inf if self.normaliser is None else CLIP)
+
+    def loaded(self) -> Loaded:
+        """To act with."""
+        actor = self.actor()
+        return Loaded(
+            lambda observations, rng: actor(observations, rng)[1],
+            self.observation_size,
+            self.space.size,
+            self.space.discrete,
+        )
+
+
+def state_of(weights: Mapping[str, Tensor], space: ActionSpace) -> State:
+    """Weights of stable-baselines3 as `MLPPolicy.load` reads them, of a policy that sees observations as they are.
+
+    The box of the bounds, which is part of our policy, is taken out of the actor's last layer: `to_sb3` puts it in.
+    """
+    found: dict[str, Floats] = {}
+    for net, body, head in (("actor", "policy_net", "action_net"), ("critic", "value_net", "value_net")):
+        names = [*_hidden_layers(weights, body), head]
+        layers = [
+            [to_numpy(weights[f"{name}.{part}"]).astype(np.float64) for part in ("weight", "bias")] for name in names
+        ]
+        if net == "actor" and space.middle is not None and space.half is not None:
+            weight, bias = layers[-1]
+            layers[-1] = [weight / space.half[:, None], (bias - space.middle) / space.half]
+            found["log_std"] = to_numpy(weights["log_std"]) - np.log(space.half)
+        found |= {f"{net}_{i}": x for i, x in enumerate(x for layer in layers for x in layer)}
+    parameters = {name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in found.items()}
+    size = parameters["actor_0"].shape[1]
+    return {"parameters": parameters, "mean": np.zeros(size), "variance": np.ones(size), "count": 0.0, "raw": True}
+
+
+def _hidden_layers(weights: Mapping[str, Tensor], body: str) -> list[str]:
+    named = sorted(int(k.split(".")[2]) for k in weights if re.fullmatch(rf"mlp_extractor\.{body}\.\d+\.weight", k))
+    return [f"mlp_extractor.{body}.{i}" for i in named]
+
+
+def read_zip(path: Path) -> Zipped:
+    """A policy in a zip. Statistics of observations are taken from `<name>.npz` beside it, if there is one.
+
+    That file holds `mean`, `var` and `count`, those of `VecNormalize`'s `obs_rms`. Raises `ValueError` for other
+    policies than perceptrons with tanh, and for what cannot be read.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            said, version = json.loads(archive.read("data")), archive.read(VERSION).decode()
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: {WANTED}, and this is none ({error})") from error
+    weights = _weights(path, version)
+    _check(path, said, weights)
+    found = Zipped(weights, _bounds(path, said["action_space"]))
+    sizes = found.space.size, found.observation_size
+    if found.bounds is not None and found.bounds[0].shape != (sizes[0],):
+        raise ValueError(f"{path}: {WANTED}; its bounds do not fit its {sizes[0]} actions")
+    return Zipped(found.weights, found.bounds, _normaliser(path, sizes[1]))
+
+
+def _weights(path: Path, version: str) -> dict[str, Tensor]:
+    import stable_baselines3
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    try:
+        _, parts, _ = load_from_zip_file(path, load_data=False)  # without it nothing is unpickled but weights
+    except Exception as error:  # torch raises many kinds of its own
+        here = stable_baselines3.__version__
+        raise ValueError(
+            f"{path}: its weights cannot be read (saved by stable-baselines3 {version}, and here is {here}): {error}"
+        ) from error
+    policy = parts.get("policy", {})
+    return {name: to_host(p) for name, p in policy.items() if isinstance(p, Tensor)}
+
+
+def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
+    """Raises `ValueError` for what is no plain perceptron with tanh over a row of numbers."""
+    known = re.compile(r"(mlp_extractor\.(policy|value)_net\.\d+|action_net|value_net)\.(weight|bias)|log_std")
+    strange = sorted(name for name in weights if not known.fullmatch(name))
+    if strange or not _hidden_layers(weights, "policy_net") or not _hidden_layers(weights, "value_net"):
+        came = f"a layer {strange[0]!r}" if strange else "no hidden layers"
+        raise ValueError(f"{path}: {WANTED}, and this policy has {came}; {OTHERS}")
+    activation = re.findall(r"\w+", _words(said.get("policy_kwargs")).get("activation_fn", "Tanh"))[-1]
+    if activation != "Tanh":
+        raise ValueError(f"{path}: expected a policy with tanh, and this one has {activation}; {OTHERS}")
+    space = _words(said.get("observation_space"))
+    if "Box" not in space.get(":type:", "") or "," in space.get("_shape", ""):
+        raise ValueError(f"{path}: expected observations in one row of numbers (a Box), got {_told(space)}; {OTHERS}")
+
+
+def _bounds(path: Path, space: Any) -> Bounds | None:
+    words = _words(space)
+    if "discrete.Discrete" in words.get(":type:", "") and words.get("start") == "0":
+        return None
+    try:
+        if "Box" not in words[":type:"]:
+            raise ValueError("no Box")
+        low, high = (np.array(re.sub(r"[\[\]]", " ", words[k]).split(), np.float32) for k in ("low", "high"))
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected actions of a Box or Discrete, got {_told(words)}; {OTHERS}") from error
+    return low, high
+
+
+def _words(told: Any) -> dict[str, str]:
+    """What `data` says of an object in words."""
+    return {k: v for k, v in told.items() if isinstance(v, str)} if isinstance(told, dict) else {}
+
+
+def _told(space: Mapping[str, str]) -> str:
+    return f"{space.get(':type:', 'nothing')} of shape {space.get('_shape', 'unknown')}"
+
+
+def _normaliser(path: Path, size: int) -> State | None:
+    """Statistics that lie beside a zip. Raises `ValueError` for those of another size, and for pickled ones."""
+    beside = path.with_suffix(".npz")
+    if not beside.exists():
+        pickled = [p for p in sorted(path.parent.glob("*.pkl")) if PICKLED.search(p.name)]
+        if pickled:
+            raise ValueError(
+                f"{pickled[0]} lies beside {path.name}: without these statistics its policy may see nothing that it "
+                "knows, and prefrl reads no pickle. In a script of your own write them as numbers, env being what "
+                f'VecNormalize.load gives: numpy.savez("{beside}", mean=env.obs_rms.mean, var=env.obs_rms.var, '
+                "count=env.obs_rms.count); or move the file away if it belongs to another policy"
+            )
+        return None
+    with np.load(beside, allow_pickle=False) as given:
+        if missing := [name for name in ("mean", "var", "count") if name not in given]:
+            raise ValueError(
+                f"{beside}: expected mean, var and count of VecNormalize's obs_rms, {missing[0]} is missing"
+            )
+        mean, variance, count = (np.asarray(given[name], np.float64) for name in ("mean", "var", "count"))
+    if mean.shape != (size,) or variance.shape != (size,) or count.shape != ():
+        raise ValueError(
+            f"{beside}: expected mean and var of {size} numbers, got shapes {mean.shape}, {variance.shape}"
+        )
+    return {"mean": mean, "variance": variance, "count": float(count), "raw": False}
+
+
+__all__: Sequence[str] = ("Zipped", "read_zip", "state_of")
