@@ -3,8 +3,8 @@
     python benchmarks/control_offline.py [--short]
     python benchmarks/control_offline.py --humans FOLDER
 
-For each seed a run of `control/pendulum` is stopped after four rounds, and the 500 comparisons of its segments become an
-.npz of pairs. From that file alone a clone, CPL and IQL learn; each is then evaluated over 20 episodes. Returns are
+For each seed a run of `control/pendulum` is stopped after four rounds, and the 500 comparisons of its segments become
+an .npz of pairs. From that file alone a clone, CPL and IQL learn; each is then evaluated over 20 episodes. Returns are
 normalised: 0 is the run's starting policy, 1 its last one. With --humans: how the policies and rewards learned from
 people's labels of Hopper and Walker2d agree with held-out pairs, and what the policies are worth in the simulator.
 """

@@ -42,9 +42,9 @@ class ActionSpace:
             return cls(task.action_size)
         low, high = (np.asarray(b, np.float32) for b in task.action_bounds)
         bounded = np.isfinite(low) & np.isfinite(high)
-        middle = np.where(bounded, (low + high) / 2, 0).astype(np.float32)
         # What has no bounds has no scale either: there the choice is the action.
-        half = np.where(bounded, (high - low) / 2, 1).astype(np.float32)
+        low, high = np.where(bounded, low, -1), np.where(bounded, high, 1)  # the sum of infinities is none
+        middle, half = ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32)
         return cls(task.action_size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
 
     @property
