@@ -11,6 +11,8 @@ from prefrl.components import ConfigError
 from prefrl.envs.segments import SegmentsSettings
 from prefrl.exchange.ports import import_judgements
 from prefrl.exchange.recordings import recording
+from prefrl.improve.control import ControlLearnerSettings
+from prefrl.improve.sb3 import SB3Settings
 from prefrl.store import Store
 from prefrl.types import Segment
 
@@ -28,7 +30,7 @@ def segments_file(path: Path, count: int = 24, discrete: bool = False, **arrays:
     observations = rng.normal(size=(count, 6, 3)).astype(np.float32)
     actions = rng.normal(size=(count, 6, 2)).astype(np.float32)
     actions = np.eye(2, dtype=np.float32)[actions.argmax(2)] if discrete else actions
-    given = {"observations": observations, "actions": actions, "rewards": observations[..., 0]} | arrays
+    given: dict[str, Any] = {"observations": observations, "actions": actions, "rewards": observations[..., 0]} | arrays
     np.savez(path, **{name: array for name, array in given.items() if array is not None})
     return path
 
@@ -38,7 +40,13 @@ def pairs_file(path: Path, count: int = 60) -> Path:
     first, second = rng.normal(size=(2, count, 6, 3)).astype(np.float32)
     push = [rng.normal(size=(count, 6, 2)).astype(np.float32) for _ in range(2)]
     labels = (push[1].sum((1, 2)) > push[0].sum((1, 2))).astype(float)
-    arrays = {"obs_1": first, "obs_2": second, "action_1": push[0], "action_2": push[1], "label_human": labels}
+    arrays: dict[str, Any] = {
+        "obs_1": first,
+        "obs_2": second,
+        "action_1": push[0],
+        "action_2": push[1],
+        "label_human": labels,
+    }
     np.savez(path, **{f"train_{name}": array for name, array in arrays.items()})
     return path
 
@@ -105,10 +113,17 @@ def test_a_bad_file_is_refused_with_what_is_wrong_with_it(tmp_path: Path, arrays
         recording(segments_file(tmp_path / "x.npz", **arrays))
 
 
+def test_learners_that_act_are_refused_when_they_are_built(tmp_path: Path) -> None:
+    task = SegmentsSettings(data=segments_file(tmp_path / "some.npz")).build()
+    for settings in (ControlLearnerSettings(), SB3Settings()):
+        with pytest.raises(ConfigError, match=r"some has no simulator: use learner\.kind=cpl or iql"):
+            settings.build(task, np.random.default_rng(0))
+
+
 def test_a_missing_file_and_lengths_that_it_has_not_are_told() -> None:
     with pytest.raises(ConfigError, match=r"task\.data: expected a file of segments"):
         SegmentsSettings().build()
-    with pytest.raises(ValueError, match="expected an .npz file of segments"):
+    with pytest.raises(ValueError, match=r"expected an \.npz file of segments"):
         recording(Path("README.md"))
 
 

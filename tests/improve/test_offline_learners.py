@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from control_stubs import Known, point
 from torch import Tensor
 
-from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.improve.cpl import CPLSettings
 from prefrl.improve.iql import IQLSettings
@@ -206,16 +204,3 @@ def test_nothing_to_learn_from_is_said() -> None:
     for kind in KINDS:
         with pytest.raises(ValueError, match=f"{kind} learns from segments: set learner.data"):
             learner(kind).improve(Known(), nothing, np.random.default_rng(0))
-
-
-def test_what_no_simulator_is_there_for_is_refused_when_it_is_built(tmp_path: Path) -> None:
-    from test_segments_task import segments_file
-
-    from prefrl.envs.segments import SegmentsSettings
-    from prefrl.improve.control import ControlLearnerSettings
-    from prefrl.improve.sb3 import SB3Settings
-
-    task = SegmentsSettings(data=segments_file(tmp_path / "some.npz")).build()
-    for settings in (ControlLearnerSettings(), SB3Settings()):
-        with pytest.raises(ConfigError, match=r"some has no simulator: use learner\.kind=cpl or iql"):
-            settings.build(task, np.random.default_rng(0))
