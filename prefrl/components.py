@@ -61,6 +61,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "imdb": "prefrl.envs.imdb:IMDBSettings",
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
+        "segments": "prefrl.envs.segments:SegmentsSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
     },
     "labelers": {
@@ -81,7 +82,9 @@ TABLE: dict[Role, dict[str, str]] = {
     },
     "learners": {
         "control": "prefrl.improve.control:ControlLearnerSettings",
+        "cpl": "prefrl.improve.cpl:CPLSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",
+        "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",

@@ -149,6 +149,15 @@ class ControlTask(Task, Protocol):
         """(T, H, W, 3) uint8 pictures of a segment, drawn from its states."""
 
 
+@runtime_checkable
+class Recorded(Protocol):
+    """A task of control whose simulator is not there: its behaviours are those of a file."""
+
+    @property
+    def segments(self) -> Sequence[Segment]:
+        """All of them; the gold is attached where the file has it."""
+
+
 class TextTask(Task, Protocol):
     """Prompts to be answered by a small language model."""
 
@@ -190,6 +199,17 @@ def control(task: Task, what: str) -> ControlTask:
     if task.kind != SEGMENTS.name:
         raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
     return cast(ControlTask, task)
+
+
+def simulated(task: Task, what: str) -> ControlTask:
+    """A task of control whose simulator is there, as `control` is for both."""
+    found = control(task, what)
+    if isinstance(task, Recorded):
+        raise ConfigError(
+            f"{what}, but {task.name} has no simulator: use learner.kind=cpl or iql, which learn from segments alone, "
+            "or task.kind=control where the simulator is there"
+        )
+    return found
 
 
 def text(task: Task, what: str) -> TextTask:
@@ -544,6 +564,7 @@ __all__ = [
     "LearnerSettings",
     "Particular",
     "Policy",
+    "Recorded",
     "RewardModel",
     "RewardSettings",
     "Selector",

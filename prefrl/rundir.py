@@ -254,7 +254,9 @@ def _refuse_strangers(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise RunError(f"{folder} is a file: choose another folder")
     found = {p.name for p in folder.iterdir()} if folder.exists() else set()
-    strangers = sorted(name for name in found if name[0] != "." and name.split(".")[0] not in ("store", "owner"))
+    strangers = sorted(
+        name for name in found if name[0] != "." and name.split(".")[0] not in ("store", "owner", "blobs")
+    )
     if strangers and "config.yaml" not in found:
         raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
 

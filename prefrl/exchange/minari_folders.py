@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from prefrl.exchange.layout import Parts, Row, answer_of
 from prefrl.exchange.reading import parse_json, read_lines, refuse_links
-from prefrl.types import Fields, Segment
+from prefrl.types import Fields, Floats, Segment
 
 LABELS = "labels.jsonl"
 
@@ -29,6 +29,26 @@ def minari_rows(folder: Path) -> Parts:
     episodes = _Episodes(_storage(folder))
     for number, line in enumerate(read_lines(folder / LABELS), 1):
         yield f"{LABELS}, row {number}", partial(_parse, line, episodes)
+
+
+def episodes(folder: Path) -> tuple[list[Segment], tuple[Floats, Floats]]:
+    """Every episode, judged or not, as a segment, and the bounds of actions (A,), infinite where there are none.
+
+    The gold is attached where rewards are the task's own: in data sets that were not exported from a store.
+    """
+    refuse_links(folder)
+    storage = _storage(folder)
+    found = []
+    for number in range(storage.total_episodes):
+        (data,), (meta,) = storage.get_episodes([number]), storage.get_episode_metadata([number])
+        options = meta.get("options") or {}
+        if "candidate" in options:
+            found.append(_segment(data, options))
+        else:
+            one = _segment(data, {"episode": f"episode {number}"})
+            found.append(replace(one, gold=np.asarray(data["rewards"], np.float64)))
+    space = storage.action_space
+    return found, (space.low.astype(np.float32), space.high.astype(np.float32))
 
 
 def _storage(folder: Path) -> Any:

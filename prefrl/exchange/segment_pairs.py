@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,20 +26,71 @@ ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
 
 def segment_pairs(path: Path) -> Parts:
     """(part and row, what reads it) for each pair. Raises `ValueError` where arrays are missing or do not fit."""
+    with _archive(path) as archive:
+        splits = _splits(archive)
+        if not splits:
+            raise ValueError(f"expected arrays named train_obs_1 and so on, got {', '.join(archive) or 'none'}")
+        for split in splits:
+            arrays, labels = _arrays(archive, split)
+            for i in range(len(arrays["obs_1"])):
+                yield f"{split}, row {i + 1}", partial(_rows, arrays, labels, split, i)
+
+
+def segments(path: Path) -> list[Segment]:
+    """Every distinct segment of pairs, judged or not, or of the arrays `observations` (N, T, O), `actions` (N, T, A)
+    and, where the gold is known, `rewards` (N, T).
+
+    Raises `ValueError` as `segment_pairs` does.
+    """
+    with _archive(path) as archive:
+        if "observations" in archive:
+            return _single(archive)
+        if not (splits := _splits(archive)):
+            known = ", ".join(archive) or "none"
+            raise ValueError(f"expected arrays named train_obs_1 and so on, or observations and actions, got {known}")
+        found: dict[str, Segment] = {}
+        for split in splits:
+            arrays, _ = _arrays(archive, split)
+            every = (_segment(arrays, split, side, i) for i in range(len(arrays["obs_1"])) for side in ("1", "2"))
+            found |= {one.id: one for one in every}
+        return list(found.values())
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    """The arrays of a file, whose name stands in front of what is wrong with them."""
     try:
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)  # a pickle can run any code
             if not isinstance(archive, Mapping):
                 raise ValueError("expected an archive of arrays, got one array")
-            splits = [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
-            if not splits:
-                raise ValueError(f"expected arrays named train_obs_1 and so on, got {', '.join(archive) or 'none'}")
-            for split in splits:
-                arrays, labels = _arrays(archive, split)
-                for i in range(len(arrays["obs_1"])):
-                    yield f"{split}, row {i + 1}", partial(_rows, arrays, labels, split, i)
+            yield archive
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _splits(archive: Mapping[str, np.ndarray]) -> list[str]:
+    return [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
+
+
+def _single(archive: Mapping[str, np.ndarray]) -> list[Segment]:
+    if "actions" not in archive:
+        raise ValueError("array actions is missing")
+    observations, actions = archive["observations"], archive["actions"]
+    gold = archive.get("rewards")
+    shapes = [array.shape for array in (observations, actions, gold) if array is not None]
+    fits = observations.ndim == actions.ndim == 3 and all(s[:2] == shapes[0][:2] for s in shapes)
+    if not fits or (gold is not None and gold.ndim != 2):
+        raise ValueError(f"expected observations (N, T, O), actions (N, T, A) and rewards (N, T), got {shapes}")
+    if any(array.dtype.kind != "f" for array in (observations, actions)):
+        raise ValueError(f"expected floats (one-hot for discrete actions), got {observations.dtype}, {actions.dtype}")
+    arrays = {"obs_1": observations, "action_1": actions}
+    plain = [_segment(arrays, "segment", "1", i) for i in range(len(observations))]
+    return (
+        plain
+        if gold is None
+        else [replace(one, gold=row.astype(np.float64)) for one, row in zip(plain, gold, strict=True)]
+    )
 
 
 def _arrays(file: Fields, split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

@@ -28,7 +28,7 @@ from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import Decisions, MLPPolicy
 from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
-from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, control
+from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
@@ -123,7 +123,7 @@ class ControlLearnerSettings(Settings):
         return float(self.steps_per_round)
 
     def build(self, task: Task, rng: np.random.Generator) -> ControlLearner:
-        return ControlLearner(self, control(task, f"learner kind {self.kind!r} acts in control tasks"), rng)
+        return ControlLearner(self, simulated(task, f"learner kind {self.kind!r} acts in control tasks"), rng)
 
     def objective(self) -> Objective:
         """What a gradient step minimises."""

@@ -16,9 +16,10 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.components import Settings
-from prefrl.fit.pairs import Batch, batch
+from prefrl.fit.pairs import Batch
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import dpo_loss, ipo_loss
+from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguagePolicy, LanguageSettings
 from prefrl.policies.responses import Responses
@@ -138,19 +139,6 @@ class Pairs:
         return gains / rows.mask.sum(1) if self.length_normalised else gains
 
 
-def shuffled(count: int, size: int, rng: np.random.Generator) -> list[Integers]:
-    """All rows once, about equally many at a time."""
-    return np.array_split(rng.permutation(count), -(-count // size))
-
-
-def judged(store: Store[Response], kind: str) -> Batch[Response]:
-    """The pairs that all judgements so far imply. Raises ValueError where there are none."""
-    data = batch(store.judged())
-    if not len(data):
-        raise ValueError(f"{kind} learns from judged pairs; the store holds none: raise loop.labels, or import some")
-    return data
-
-
 def step(writer: Writer, settings: HeldSettings, pairs: Pairs, at: Integers, loss: PairLoss) -> Metrics:
     """One gradient step on some pairs.
 
@@ -170,16 +158,8 @@ def _parts(policy: LanguagePolicy, settings: HeldSettings, pairs: Pairs, at: Int
         arrays = (pairs.weight[some] / pairs.weight[at].sum(), pairs.edges[some].flatten(), pairs.preference[some])
         share, flat, preference = (torch.from_numpy(x).to(policy.device) for x in arrays)
         gains = pairs.gains(policy, flat).view(-1, 2)
-        margin = settings.beta * (gains[:, 0] - gains[:, 1]).detach()
-        signed = margin * (2 * preference - 1).sign()  # 0 for a tie, which makes it half right below
-        seen = {"accuracy": (share * (signed.sign() + 1) / 2).sum(), "margin": (share * signed).sum()}
-        yield (loss(gains, preference) * share).sum(), seen
-
-
-def means(seen: list[Metrics]) -> Metrics:
-    """Of each measure over the steps that have it."""
-    names = dict.fromkeys(name for one in seen for name in one)
-    return {name: float(np.mean([one[name] for one in seen if name in one])) for name in names}
+        margins = settings.beta * (gains[:, 0] - gains[:, 1]).detach()
+        yield (loss(gains, preference) * share).sum(), measured(margins, preference, share)
 
 
 class Direct:

@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from prefrl.improve.direct import Direct, PairLossSettings, Pairs, judged, means, pair_formula, step
+from prefrl.improve.direct import Direct, PairLossSettings, Pairs, pair_formula, step
+from prefrl.improve.pairs import judged, means
 from prefrl.improve.writer import Writer
 from prefrl.protocols import RewardModel, Store, Task, text
 from prefrl.types import Metrics, Response

@@ -8,7 +8,7 @@ many parts it goes through the network in. It sees a policy and a batch, and not
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, cast
 
@@ -166,6 +166,28 @@ def descend(
     world().sum_gradients(parameters)
     metrics = _added(names, torch.stack(measured).tolist() if measured else [])
     return _moved(parameters, optimizer, metrics, max_grad_norm)
+
+
+def descend_by_logp(
+    policy: Policy[I],
+    optimizer: torch.optim.Optimizer,
+    inputs: I,
+    loss_of: Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]],
+    max_grad_norm: float,
+) -> Metrics:
+    """One gradient step on a loss of the log-probabilities (B, L) alone, by hand where the policy's gradient is.
+
+    `loss_of` gives the loss and what it measured beside. Raises FloatingPointError as `descend` does.
+    """
+    if not (isinstance(policy, ByHand) and policy.works_by_hand):
+        return descend(policy.parameters(), optimizer, [loss_of(policy.log_prob(inputs)[0])], max_grad_norm)
+    logp, _, _, pull_back = policy.by_hand(cast(Columns, inputs).columns(), True, False)
+    leaf = torch.from_numpy(logp).requires_grad_()
+    loss, seen = loss_of(leaf)
+    (slope,) = torch.autograd.grad(loss, leaf)
+    pull_back(to_numpy(slope), 0.0, None)
+    metrics = {name: float(x) for name, x in {"loss": loss.detach(), **seen}.items()}
+    return _moved(policy.parameters(), optimizer, metrics, max_grad_norm)
 
 
 def _moved(

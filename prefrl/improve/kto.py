@@ -18,8 +18,9 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from prefrl.improve.direct import Direct, HeldSettings, Pairs, judged, means, step
+from prefrl.improve.direct import Direct, HeldSettings, Pairs, step
 from prefrl.improve.objectives import kto_loss
+from prefrl.improve.pairs import judged, means
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguagePolicy
 from prefrl.policies.logprobs import in_all_rows

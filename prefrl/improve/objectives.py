@@ -237,6 +237,22 @@ def kto_loss(gains: Tensor, desirable: Tensor, point: Tensor, beta: float) -> Te
     return torch.sigmoid(-beta * torch.where(desirable, lead, -lead))  # 1 - s(x) is s(-x)
 
 
+def cpl_loss(first: Tensor, second: Tensor, preference: Tensor, bias: float) -> Tensor:
+    """(M,) losses of pairs of segments from their scores (M,): alpha x the discounted sums of log pi(a|s).
+
+    Hejna et al. 2024, equation 5, with the conservative bias of equation 6: the score of the worse one counts `bias`
+    times, so that it does not help to make both improbable. A soft preference p is p times the loss with the first as
+    the better one, plus 1 - p times the loss with the second.
+    """
+    ahead, behind = logsigmoid(first - bias * second), logsigmoid(second - bias * first)
+    return -(preference * ahead + (1 - preference) * behind)
+
+
+def expectile_loss(errors: Tensor, expectile: float) -> Tensor:
+    """Squares that weigh `expectile` above 0 and 1 - `expectile` below (Kostrikov et al. 2022, equation 4)."""
+    return torch.where(errors > 0, expectile, 1 - expectile) * errors**2
+
+
 def _right(preference: Tensor, smoothing: float) -> Tensor:
     """(M,) the probability that the first of a pair is better."""
     return preference * (1 - smoothing) + (1 - preference) * smoothing

@@ -17,7 +17,8 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.evaluate.policies import scored
-from prefrl.improve.direct import Direct, PairLossSettings, Pairs, means, pair_formula, step
+from prefrl.improve.direct import Direct, PairLossSettings, Pairs, pair_formula, step
+from prefrl.improve.pairs import means
 from prefrl.improve.writer import Writer
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, text

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from prefrl.evaluate.best_of_n import best
 from prefrl.evaluate.policies import scored
-from prefrl.improve.direct import Direct, DirectSettings, shuffled
+from prefrl.improve.direct import Direct, DirectSettings
 from prefrl.improve.objectives import kl_k1
+from prefrl.improve.pairs import shuffled
 from prefrl.improve.sft import supervised
 from prefrl.improve.writer import Writer
 from prefrl.policies.language import LanguagePolicy

@@ -29,7 +29,7 @@ from prefrl.improve.replay import cut, load_replay, relabel, replay_state
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
 from prefrl.policies.loaded import Actor
 from prefrl.policies.rollout import Act, Rollout, step_rewards
-from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
+from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
@@ -158,7 +158,7 @@ class SB3Settings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> SB3:
         """Raises `ConfigError` for options that the algorithm does not have, and steps that it cannot take exactly."""
-        found = control(task, f"learner kind {self.kind!r} acts in control tasks")
+        found = simulated(task, f"learner kind {self.kind!r} acts in control tasks")
         wanted, here = ALGORITHMS[self.algorithm].actions, "discrete" if found.action_bounds is None else "box"
         if wanted not in ("any", here):
             fitting = [name for name, known in ALGORITHMS.items() if known.actions in ("any", here)]

@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from prefrl.improve.direct import Direct, DirectSettings, means, shuffled
+from prefrl.improve.direct import Direct, DirectSettings
 from prefrl.improve.gradient import Parts, descend, in_parts
+from prefrl.improve.pairs import means, shuffled
 from prefrl.improve.writer import Writer
 from prefrl.judgements import good
 from prefrl.policies.language import LanguagePolicy

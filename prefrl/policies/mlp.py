@@ -47,9 +47,9 @@ class ActionSpace:
             return cls(size)
         low, high = (np.asarray(b, np.float32) for b in bounds)
         bounded = np.isfinite(low) & np.isfinite(high)
-        middle = np.where(bounded, (low + high) / 2, 0).astype(np.float32)
         # What has no bounds has no scale either: there the choice is the action.
-        half = np.where(bounded, (high - low) / 2, 1).astype(np.float32)
+        low, high = np.where(bounded, low, -1), np.where(bounded, high, 1)  # the sum of infinities is none
+        middle, half = ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32)
         return cls(size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
 
     @property
@@ -62,6 +62,13 @@ class ActionSpace:
             return choices
         # The log-probability is that of the choice before the clip, which is part of the world like the simulator.
         return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
+
+    def choices(self, actions: Floats) -> Floats:
+        """(..., A) actions that were executed -> (..., A) float32 choices that lead to them."""
+        if self.middle is None or self.half is None:
+            return actions
+        found: Floats = ((actions - self.middle) / self.half).astype(np.float32)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +159,16 @@ class MLPPolicy:
     is the gradient (`by_hand`): for networks this small torch's overhead would be most of the time.
     """
 
-    def __init__(self, task: ControlTask, hidden: tuple[int, ...], initial_std: float, rng: np.random.Generator):
+    def __init__(
+        self,
+        task: ControlTask,
+        hidden: tuple[int, ...],
+        initial_std: float,
+        rng: np.random.Generator,
+        learns_std: bool = True,
+    ):
+        """`learns_std`: false where the standard deviation stays what it is at first."""
+        self._learns_std = learns_std
         self.space = ActionSpace.of(task)
         size, order = task.observation_size, generator(rng)
         nets = {"actor": _mlp((size, *hidden, task.action_size), 0.01, order)}
@@ -240,12 +256,19 @@ class MLPPolicy:
             every = outputs.log_softmax(-1)
             logp = (every * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
             return logp, -(every.exp() * every).sum(-1, keepdim=True)
-        log_std = self.named()["log_std"]
+        log_std = self.named()["log_std"] if self._learns_std else self.named()["log_std"].detach()
         scaled = (inputs.choices - outputs) * (-log_std).exp()
         constant = log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
         entropy = constant + 0.5 * self.space.size
         # A Gaussian's entropy hangs on its std alone, which is the same in every state.
         return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(len(outputs), 1)
+
+    @property
+    def peak(self) -> float:
+        """The log-density of the mode, the same in every state; 0 where actions are discrete, which have none."""
+        if self.space.discrete:
+            return 0.0
+        return -float(self.named()["log_std"].detach().sum()) - 0.5 * self.space.size * math.log(2 * math.pi)
 
     def values(self, inputs: Decisions) -> Tensor:
         """(B, 1)."""
@@ -281,7 +304,7 @@ class MLPPolicy:
                 of_outputs, of_std = head.slopes(of_logp, of_entropy)
                 backward(of_outputs, weights.actor, traces[0], "tanh", slopes.actor)
                 if slopes.log_std is not None:
-                    slopes.log_std[:] = of_std
+                    slopes.log_std[:] = of_std if self._learns_std else 0.0
             if of_values is not None:
                 backward(of_values, weights.critic, traces[-1], "tanh", slopes.critic)
 

@@ -1,0 +1,48 @@
+"""Behaviour from a file, judged or not: segments in an .npz, or the episodes of a Minari data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from prefrl.types import Floats, Segment
+
+
+class Recording(NamedTuple):
+    """All that a file holds."""
+
+    segments: tuple[Segment, ...]
+    """At least one; the gold is attached where the file has it."""
+    bounds: tuple[Floats, Floats] | None
+    """(A,) each of actions, infinite where the file knows none; None where actions are one-hot."""
+
+
+def recording(path: Path) -> Recording:
+    """Read a file of segments or of pairs of them (.npz), or the folder of a Minari data set.
+
+    Actions that are all one-hot are discrete. Raises `ValueError` for anything else, and where sizes differ.
+    """
+    if path.suffix == ".npz" and path.is_file():
+        from prefrl.exchange.segment_pairs import segments
+
+        found, bounds = segments(path), None
+    elif (path / "metadata.json").exists():
+        from prefrl.exchange.minari_folders import episodes
+
+        found, bounds = episodes(path)
+    else:
+        raise ValueError(f"{path}: expected an .npz file of segments, or the folder of a Minari data set")
+    sizes = {(one.observations.shape[1], one.actions.shape[1]) for one in found}
+    if len(sizes) != 1:
+        got = " and ".join(map(str, sorted(sizes))) or "no segment"
+        raise ValueError(f"{path}: expected observations and actions of one size each, got {got}")
+    ((_, size),) = sizes
+    free = (np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32))
+    discrete = size > 1 and all(_one_hot(one.actions) for one in found)
+    return Recording(tuple(found), None if discrete else bounds or free)
+
+
+def _one_hot(actions: Floats) -> bool:
+    return bool(np.isin(actions, (0.0, 1.0)).all() and (actions.sum(1) == 1).all())

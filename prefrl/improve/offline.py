@@ -1,0 +1,272 @@
+"""What the learners from recorded segments share: the steps of segments, cloning, and a learner around both.
+
+Nothing is acted out to learn from. Where the task's simulator is there it serves evaluation, and where no file is
+given, sampling. The policy starts as a clone of all segments (behaviour cloning by maximum likelihood), and its
+observation normaliser is that of the segments it was cloned from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Self, TypeAlias
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from prefrl.components import Settings
+from prefrl.exchange.recordings import recording
+from prefrl.fit.pairs import Batch, batch
+from prefrl.fit.split import split
+from prefrl.improve.gradient import adam_of, descend_by_logp
+from prefrl.improve.pairs import measured, shuffled
+from prefrl.improve.player import Player
+from prefrl.kinds import SEGMENTS
+from prefrl.policies.loaded import Actor
+from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.rollout import Act
+from prefrl.protocols import ControlTask, Recorded, RewardModel, Store
+from prefrl.seeding import Device, device_of
+from prefrl.types import Evaluation, Integers, Metrics, Segment, State, Steps
+
+AT_ONCE = 8
+"""Environments that are stepped side by side, where there are any."""
+
+
+class OfflineSettings(Settings):
+    """The settings that all these learners have; each one's class adds its kind and what is particular to it."""
+
+    kind: str
+    data: Path | None = None
+    """Behaviour to learn from beside what was judged: an .npz file of segments, or a Minari data set. What is asked
+    about is cut from it as well. A task of kind `segments` has a file already."""
+    learning_rate: float = Field(1e-3, gt=0)
+    """Adam's."""
+    max_grad_norm: float = Field(1.0, gt=0)
+    """A gradient that is longer is shortened to this."""
+    cloning_epochs: int = Field(20, ge=0)
+    """Passes over all segments before anything else is learned, in the first round."""
+    cloning_minibatch: int = Field(256, ge=1)
+    """Steps in a gradient step of cloning."""
+    held_out: float = Field(0.1, ge=0, lt=1)
+    """The share of judgements that is not learned from, and that the policy is then measured on."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the policy's hidden layers."""
+    std: float = Field(0.7, gt=0)
+    """Of the actions' noise, in units of half the action bounds. It is not learned."""
+    evaluation_episodes: int = Field(20, ge=1)
+    """Episodes of an evaluation, with the policy's mode, where the simulator is there."""
+    device: Device = "auto"
+    """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
+    threads: int | None = Field(1, ge=1)
+    """With how many threads torch and BLAS compute: more make small networks slower; null leaves it to them."""
+
+    def shrunk(self) -> Self:
+        return self.model_copy(update={"cloning_epochs": min(self.cloning_epochs, 1), "evaluation_episodes": 1})
+
+    def with_evaluation_of(self, other: Self) -> Self:
+        return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """S steps of N segments, one after another."""
+
+    decisions: Decisions
+    starts: Integers
+    """(N,) the row of each segment's first step."""
+    lengths: Integers
+    """(N,)."""
+
+    @classmethod
+    def of(cls, segments: Sequence[Segment], policy: MLPPolicy) -> Recordings:
+        observations = policy.normalise(np.concatenate([one.observations for one in segments]))
+        choices = policy.space.choices(np.concatenate([one.actions for one in segments]))
+        lengths = np.array([len(one) for one in segments])
+        arrays = (torch.from_numpy(x).to(policy.device) for x in (observations, choices))
+        return cls(Decisions(*arrays), np.cumsum(lengths) - lengths, lengths)
+
+    def steps(self, at: Integers) -> tuple[Integers, Integers, Integers]:
+        """Of some segments: the rows of their steps, whose each is among those, and how many came before it."""
+        lengths = self.lengths[at]
+        whose = np.repeat(np.arange(len(at)), lengths)
+        before = np.arange(len(whose)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        return self.starts[at][whose] + before, whose, before
+
+
+class Material(NamedTuple):
+    """What a round learns from, nothing held out among it."""
+
+    pairs: Batch[Segment]
+    segments: tuple[Segment, ...]
+    """Judged ones and those of the file."""
+
+
+Improve: TypeAlias = Callable[["Offline", Material, RewardModel[Segment], np.random.Generator], Metrics]
+"""One round's worth of learning, after cloning."""
+
+
+class Offline:
+    """A `prefrl.protocols.Learner` of segments that takes no step to learn; methods differ in how they improve alone.
+
+    `discount` and `alpha` make a score of a segment's log-probabilities, which held-out judgements are compared with;
+    without an alpha only its sign counts.
+    """
+
+    def __init__(
+        self,
+        settings: OfflineSettings,
+        task: ControlTask,
+        improve: Improve,
+        rng: np.random.Generator,
+        discount: float = 1.0,
+        alpha: float | None = None,
+    ) -> None:
+        self._settings, self._task, self._improve = settings, task, improve
+        self._discount, self._alpha = discount, alpha
+        self.policy = MLPPolicy(task, settings.hidden, settings.std, rng, learns_std=False)
+        self.policy.to(device_of(settings.device))
+        self.optimizer = adam_of(self.policy, settings.learning_rate)
+        self._player, self._measured = Player(task, AT_ONCE), Metrics()
+        self._data = _data(settings.data, task)
+
+    @property
+    def steps(self) -> Steps:
+        return self._player.steps
+
+    def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
+        """Pieces of the file, as many as it has; without one, of what the policy does (query steps)."""
+        if not self._data:
+            return self._player.sample(count, self._act(rng), rng)
+        length = self._task.segment_steps
+        places = [(i, t) for i, one in enumerate(self._data) for t in range(len(one) - length + 1)]
+        chosen = rng.choice(len(places), min(count, len(places)), replace=False)
+        return [_piece(self._data[i], t, length) for i, t in (places[c] for c in sorted(chosen))]
+
+    def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
+        """Clone in the first round, and learn by the method. Metrics: the method's, and cloning_loss where it cloned
+        (mean of the squared distance to a recorded action over twice its variance, or of -log pi, in the last pass).
+
+        Raises ValueError where there is nothing to learn from.
+        """
+        judged = store.judged() if store is not None else []
+        out = split(judged, self._settings.held_out) if judged else np.zeros(0, bool)
+        held = batch([one for one, left in zip(judged, out, strict=True) if left])
+        kept = batch([one for one, left in zip(judged, out, strict=True) if not left])
+        apart = {one.id for one in held.candidates}
+        every = {one.id: one for one in (*kept.candidates, *self._data) if one.id not in apart}
+        if not every:
+            raise ValueError(f"{self._settings.kind} learns from segments: set learner.data, or import judged ones")
+        material = Material(kept, tuple(every.values()))
+        metrics = self._clone(material.segments, rng) | self._improve(self, material, reward, rng)
+        self._player.rounds += 1
+        self._measured = self._agreement(held) if len(held) else {}
+        return metrics
+
+    def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
+        """The policy's mode in fresh environments, where there are any, and what was measured on held-out judgements:
+        agreement, and judgement_loss where scores have a scale."""
+        if isinstance(self._task, Recorded):
+            return Evaluation({"gold": float("nan")} | self._measured)
+        found = self._player.evaluate(self._settings.evaluation_episodes, self._act(None), reward, rng)
+        return Evaluation(found.metrics | self._measured, found.examples, found.notes)
+
+    def scores(self, logp: Tensor, whose: Integers, before: Integers) -> Tensor:
+        """(S, 1) log-probabilities of segments' steps -> (N,) their discounted sums, each step's against the mode's.
+
+        A density has no scale of its own; against the mode's it is a distance, as in the paper's code.
+        """
+        weights = torch.from_numpy((self._discount**before).astype(np.float32)).to(logp)
+        owners = torch.from_numpy(whose).to(logp.device)
+        return logp.new_zeros(int(whose[-1]) + 1).index_add(0, owners, weights * (logp[:, 0] - self.policy.peak))
+
+    def actor(self) -> Actor:
+        actor = self.policy.numpy_actor()
+        return lambda observations, rng: actor(observations, rng)[1]
+
+    def save(self, path: Path) -> None:
+        """As a zip of stable-baselines3's PPO, which acts as this policy does."""
+        from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
+
+        save_ppo(self.policy, self._task, self._settings.hidden, path)
+
+    def state(self) -> State:
+        learned = {"policy": self.policy.state(), "optimizer": self.optimizer.state_dict()}
+        return learned | {"measured": self._measured} | self._player.state()
+
+    def load(self, state: State) -> None:
+        self.policy.load(state["policy"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self._measured = state["measured"]
+        self._player.load(state)
+
+    def _clone(self, segments: Sequence[Segment], rng: np.random.Generator) -> Metrics:
+        if self.policy.count:
+            return {}
+        self.policy.observe(np.concatenate([one.observations for one in segments]))
+        steps, settings = Recordings.of(segments, self.policy).decisions, self._settings
+        found: list[Metrics] = []
+        for _ in range(settings.cloning_epochs):
+            parts = shuffled(len(steps.choices), settings.cloning_minibatch, rng)
+            found = [self.descend(steps, rows, self._surprise) for rows in parts]
+        return {"cloning_loss": float(np.mean([one["loss"] for one in found]))} if found else {}
+
+    def descend(
+        self, steps: Decisions, rows: Integers, loss_of: Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]]
+    ) -> Metrics:
+        """One gradient step of the policy on a loss of the log-probabilities (b, 1) of some steps."""
+        some = steps.rows(torch.from_numpy(rows).to(self.policy.device))
+        return descend_by_logp(self.policy, self.optimizer, some, loss_of, self._settings.max_grad_norm)
+
+    def _surprise(self, logp: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        return (self.policy.peak - logp).mean(), {}
+
+    @torch.no_grad()
+    def _agreement(self, held: Batch[Segment]) -> Metrics:
+        """How held-out judgements agree with the policy's scores."""
+        recordings = Recordings.of(held.candidates, self.policy)
+        _, whose, before = recordings.steps(np.arange(len(held.candidates)))  # in order: the rows are all of them
+        scores = self.scores(self.policy.log_prob(recordings.decisions)[0], whose, before)
+        edges, preference, weight = (
+            torch.from_numpy(x).to(scores.device) for x in (held.edges, held.preference, held.weight)
+        )
+        share, gaps = weight / weight.sum(), scores[edges[:, 0]] - scores[edges[:, 1]]
+        found = {"agreement": float(measured(gaps, preference, share)["accuracy"])}
+        if self._alpha is None:
+            return found
+        losses = torch.nn.functional.binary_cross_entropy_with_logits(self._alpha * gaps, preference, reduction="none")
+        return found | {"judgement_loss": float((share * losses).sum())}
+
+    def _act(self, rng: np.random.Generator | None) -> Act:
+        actor = self.policy.numpy_actor()
+        return lambda observations, legal: actor(observations, rng, legal)
+
+
+def minibatches(count: int, epochs: int, size: int, rng: np.random.Generator) -> Iterator[Integers]:
+    """Rows, each once an epoch."""
+    for _ in range(epochs):
+        yield from shuffled(count, size, rng)
+
+
+def _data(path: Path | None, task: ControlTask) -> tuple[Segment, ...]:
+    """The segments of the file, or of the task. Raises `ValueError` where they do not fit the task."""
+    if path is None:
+        return tuple(task.segments) if isinstance(task, Recorded) else ()
+    found = recording(path).segments
+    if misfit := SEGMENTS.misfit(found[0], task):
+        raise ValueError(f"learner.data: a segment of {path} {misfit}: choose another file or task")
+    if all(len(one) < task.segment_steps for one in found):
+        raise ValueError(f"learner.data: {path} has no segment of task.segment_steps={task.segment_steps} steps")
+    return found
+
+
+def _piece(one: Segment, start: int, length: int) -> Segment:
+    part = slice(start, start + length)
+    states, gold = (None if x is None else x[part] for x in (one.states, one.gold))
+    return Segment(one.observations[part], one.actions[part], one.episode, one.start + start, states, gold)
+
+
+__all__: Sequence[str] = ("Improve", "Material", "Offline", "OfflineSettings", "Recordings", "minibatches")
