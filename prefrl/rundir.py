@@ -105,7 +105,7 @@ class Run:
             raise type(error)(f"{error}\n{self._left()}") from error
 
     def _left(self) -> str:
-        if not _checkpoints(self.folder):
+        if not checkpoints(self.folder):
             return f"no round was finished: nothing is lost in {self.folder}"
         folder, _ = _newest(self.folder)
         return f"the last good checkpoint is {folder}; once that is dealt with, go on with: prefrl resume {self.folder}"
