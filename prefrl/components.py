@@ -62,6 +62,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
+        "tmaze": "prefrl.envs.toys:TMazeSettings",
     },
     "labelers": {
         "crowd": "prefrl.label.crowd:CrowdSettings",

@@ -108,7 +108,7 @@ def learned(settings: Any, task: Any, model: Any) -> tuple[Any, Any]:
 def test_a_control_learner_keeps_to_its_device_and_learns_the_same_there() -> None:
     kind: Any = settings_class("learners", "control")
     small = {"environments": 2, "steps_per_round": 16, "rollout_steps": 8, "epochs": 1, "critic_epochs": 1}
-    settings = kind(**small, minibatch=8, hidden=(8,), evaluation_episodes=2)
+    settings = kind(**small, minibatch=8, policy={"hidden": (8,)}, evaluation_episodes=2)
 
     def round_of(device: torch.device) -> tuple[Any, Any]:
         model = reward("mlp")

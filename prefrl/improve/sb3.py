@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from prefrl.components import ConfigError, Settings, missing
 from prefrl.improve.player import Player
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed, relabel
+from prefrl.policies.acting import Memory
 from prefrl.policies.loaded import Actor
 from prefrl.policies.rollout import Act, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, control
@@ -188,7 +189,11 @@ class SB3:
         return self._player.evaluate(self._settings.evaluation_episodes, act, reward, rng)
 
     def actor(self) -> Actor:
-        return lambda observations, rng: self._act(deterministic=rng is None)(observations, None)[1]
+        def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
+            fresh = np.zeros(len(observations), bool)
+            return self._act(deterministic=rng is None)(observations, None, fresh)[1], memory
+
+        return act
 
     def save(self, path: Path) -> None:
         """As stable-baselines3 saves it: `SAC.load` and its like read it."""
@@ -216,7 +221,7 @@ class SB3:
         self._player.load(state)
 
     def _act(self, deterministic: bool) -> Act:
-        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+        def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
             chosen, _ = self.model.predict(observations, deterministic=deterministic)
             actions = executed(self._env.action_space, chosen)
             return actions, actions
