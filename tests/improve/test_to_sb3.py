@@ -19,6 +19,10 @@ from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.rundir import RunError
 from prefrl.stages import export_sb3, shrink
 
+PLAIN = MLPPolicySettings(hidden=(16, 8))
+OTHER = MLPPolicySettings(hidden=(16, 8), critic_hidden=(12,), activation="relu")
+POLICIES = {"Pendulum-v1": PLAIN, "CartPole-v1": PLAIN, "Hopper-v5": OTHER}
+
 
 def run(folder: Path, name: str, *settings: str) -> Path:
     with Run(shrink(Config.load(name, settings)), folder) as made:
@@ -29,7 +33,7 @@ def run(folder: Path, name: str, *settings: str) -> Path:
 @pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1", "Hopper-v5"])
 def test_the_zip_acts_as_the_policy_does(env: str, tmp_path: Path) -> None:
     task, rng = ControlSettings(env=env, horizon=200).build(), np.random.default_rng(0)
-    learner = ControlLearnerSettings(policy=MLPPolicySettings(hidden=(16, 8)), device="cpu").build(task, rng)
+    learner = ControlLearnerSettings(policy=POLICIES[env], device="cpu").build(task, rng)
     assert isinstance(learner.policy, MLPPolicy)
     learner.policy.observe(rng.normal(0.3, 2.0, (500, task.observation_size)))
     for _, parameter in learner.policy.named().items():
