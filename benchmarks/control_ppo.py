@@ -86,8 +86,7 @@ class Ours:
         learner.improve(cast(RewardModel[Segment], None), cast(Store[Segment], None), self._rng)
 
     def gold(self) -> float:
-        actor = self._learner.policy.numpy_actor()
-        rollout = whole_episodes(self._task, lambda o, legal: actor(o, None, legal), EPISODES, np.random.default_rng(9))
+        rollout = whole_episodes(self._task, self._learner._act(None), EPISODES, np.random.default_rng(9))
         # Until the first end of each.
         alive = np.cumsum(rollout.ends, 1) - rollout.ends == 0
         return float((rollout.gold * alive).sum(1).mean())

@@ -160,9 +160,7 @@ def segments(case: Case, task: Any) -> tuple[list[Any], list[Any]]:
             for name, count in (("pool", case.pool), ("test", case.tested)):
                 count //= config.loop.rounds + 1
                 episodes = max(2, 2 * count * task.segment_steps // task.horizon)
-                rollout = whole_episodes(
-                    task, lambda o, legal: loop.learner.policy.act(o, rng, legal), min(episodes, 100), rng
-                )
+                rollout = whole_episodes(task, loop.learner._act(rng), min(episodes, 100), rng)
                 parts.append(cut(rollout, task.segment_steps, count, f"{name} {stage.number}", rng))
             pool, tested = pool + parts[0], tested + parts[1]
     return pool, tested

@@ -45,6 +45,96 @@ class Point:
         return picture
 
 
+@dataclass(frozen=True)
+class TMaze:
+    """A corridor that ends in two arms, and a sign at its start that says which one is right; then it is out of sight.
+
+    Variant: the passive T-maze of Ni et al. 2023 (section 5.1) after Bakker 2001: whoever goes straight on is at the
+    junction for the last of `length` steps. The gold is 1 for the right arm, and minus 1 / `length` for each step that
+    does not lead on. So who remembers gets 1, and who does not can get 0.5 on average.
+
+    A state is (place, side of the right arm, arm that was taken, age); actions are on, left, right.
+    """
+
+    length: int
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        states = np.zeros((count, 4))
+        states[:, 1] = rng.choice([-1.0, 1.0], count)
+        return states
+
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
+        place, side, arm, age = states.T
+        move = actions.argmax(1)
+        junction, on = place >= self.length - 1, move == 0
+        turns = junction & (arm == 0) & ~on
+        taken = np.where(turns, np.where(move == 1, -1.0, 1.0), arm)
+        following = np.stack([place + (on & ~junction), side, taken, age + 1], 1)
+        idle = np.where(junction, on & (arm == 0), ~on)
+        return following, 1.0 * (turns & (taken == side)) - idle / self.length, np.zeros(len(states), bool)
+
+    def observe(self, states: Floats) -> Floats:
+        """(n, 2): the sign, -1 or 1, at the first step and 0 later; and whether this is the junction."""
+        place, side, _, age = states.T
+        return np.stack([np.where(age == 0, side, 0.0), place >= self.length - 1], 1).astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        """From above: the corridor from left to right, the right arm in orange, the walker in blue."""
+        picture = np.full((size, size, 3), 60, np.uint8)
+        cell = max(1, size // (self.length + 1))
+        middle, last = size // 2, (self.length - 1) * cell
+        picture[middle : middle + cell, : last + cell] = 246
+        picture[middle - 2 * cell : middle + 3 * cell, last : last + cell] = 246
+        place, side, arm, _ = state
+        for row, column, ink in ((2 * side, last, MARK), (2 * arm, int(place) * cell, INK)):
+            top = middle + int(row) * cell
+            picture[top : top + cell, column : column + cell] = ink
+        return picture
+
+
+class TMazeSettings(Settings):
+    """A corridor with a sign at its start, and at its end two arms, of which the sign said which one is right."""
+
+    kind: Literal["tmaze"] = "tmaze"
+    length: int = Field(20, ge=2)
+    """Steps of an episode: the last one turns left or right, if those before led straight on."""
+    segment_steps: int | None = Field(None, ge=1)
+    """Steps of a judged segment; whole episodes when left out, since only they show both the sign and the turn."""
+    frame_size: int = Field(120, ge=16, le=2048)
+    """Height and width of drawn frames, in pixels."""
+
+    def build(self) -> TMazeTask:
+        steps = self.segment_steps or self.length
+        if steps > self.length:
+            raise ConfigError(f"task: a segment of {steps} steps is longer than an episode of {self.length}")
+        return TMazeTask(self.length, steps, self.frame_size)
+
+
+@dataclass(frozen=True)
+class TMazeTask:
+    """A `prefrl.protocols.ControlTask`."""
+
+    horizon: int
+    segment_steps: int
+    frame_size: int
+    name: str = "tmaze"
+    kind: str = "control"
+    observation_size: int = 2
+    action_size: int = 3
+    action_bounds: None = None
+    fps: float = 5.0
+
+    def environments(self, count: int) -> Environments:
+        return Vectorised(TMaze(self.horizon), count, self.horizon)
+
+    def frames(self, segment: Segment) -> np.ndarray:
+        """(T, frame_size, frame_size, 3). Raises `ValueError` where the segment keeps no states."""
+        return _drawn(TMaze(self.horizon), segment, self.frame_size)
+
+
 class PointSettings(Settings):
     """A point in the plane that should go to the middle, and stay there."""
 
@@ -86,6 +176,10 @@ class PointTask:
 
     def frames(self, segment: Segment) -> np.ndarray:
         """(T, frame_size, frame_size, 3). Raises `ValueError` where the segment keeps no states."""
-        if segment.states is None:
-            raise ValueError("a segment can only be drawn from its simulator states, and this one has none")
-        return np.stack([Point().picture(state, self.frame_size) for state in segment.states])
+        return _drawn(Point(), segment, self.frame_size)
+
+
+def _drawn(world: Point | TMaze, segment: Segment, size: int) -> np.ndarray:
+    if segment.states is None:
+        raise ValueError("a segment can only be drawn from its simulator states, and this one has none")
+    return np.stack([world.picture(state, size) for state in segment.states])

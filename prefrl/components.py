@@ -63,6 +63,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "reviews": "prefrl.envs.text:ReviewsSettings",
         "segments": "prefrl.envs.segments:SegmentsSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
+        "tmaze": "prefrl.envs.toys:TMazeSettings",
     },
     "labelers": {
         "crowd": "prefrl.label.crowd:CrowdSettings",

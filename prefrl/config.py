@@ -7,7 +7,7 @@ from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
 import numpy as np
 import yaml
@@ -241,11 +241,13 @@ def _expected(error: ErrorDetails) -> str:
 
 def _explain(cls: type[Settings], error: ErrorDetails) -> str:
     """One line a mistake: `.dotted.path: what was expected, what came`."""
-    path = "".join(f".{part}" for part in error["loc"])
+    names, group = _place(cls, error["loc"])
+    path = "".join(f".{name}" for name in names)
     if error["type"] == "extra_forbidden":
-        *parents, last = error["loc"]
-        known = _fields(cls, [str(p) for p in parents])
-        return f"{path}: unknown setting; {suggest(str(last), known)}"
+        return f"{path}: unknown setting; {suggest(names[-1], group.model_fields)}"
+    if error["type"] == "union_tag_invalid":
+        tags = [tag.strip(" '") for tag in error["ctx"]["expected_tags"].split(",")]
+        return f"{path}.kind: unknown kind {error['ctx']['tag']!r}; {suggest(error['ctx']['tag'], tags)}"
     if error["type"] == "missing":
         return f"{path}: missing; expected a value"
     if error["type"] == "value_error":
@@ -254,10 +256,21 @@ def _explain(cls: type[Settings], error: ErrorDetails) -> str:
     return f"{path}: expected {_expected(error)}, got {error['input']!r}"
 
 
-def _fields(cls: type[Settings], parents: Iterable[str]) -> list[str]:
-    """The names of the settings in a group."""
-    for parent in parents:
-        annotation = cls.model_fields[parent].annotation
-        if isinstance(annotation, type) and issubclass(annotation, Settings):
-            cls = annotation
-    return list(cls.model_fields)
+def _place(cls: type[Settings], loc: Iterable[int | str]) -> tuple[list[str], type[Settings]]:
+    """The dotted path of a mistake, and the group that its last name is of.
+
+    Where a group is one of several kinds, pydantic's path names the kind as well.
+    """
+    names, parts = list[str](), [str(part) for part in loc]
+    while parts:
+        names.append(parts.pop(0))
+        field = cls.model_fields.get(names[-1])
+        if not parts or field is None:
+            continue
+        kinds = get_args(field.annotation) if field.discriminator else (field.annotation,)
+        groups = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Settings)]
+        if field.discriminator:
+            tag = parts.pop(0)
+            groups = [group for group in groups if group.model_fields["kind"].default == tag]
+        cls = groups[0] if groups else cls
+    return names, cls

@@ -489,8 +489,11 @@ class Settles(Protocol[C]):
 class Acts(Protocol):
     """A learner whose policy acts in environments."""
 
-    def actor(self) -> Callable[[Floats, np.random.Generator | None], Floats]:
-        """(n, O) observations -> (n, A) actions to execute: the policy's mode, or drawn where there is a generator."""
+    def actor(
+        self,
+    ) -> Callable[[Floats, np.random.Generator | None, Floats | None], tuple[Floats, Floats | None]]:
+        """(n, O) observations, and (n, M) what is remembered, None at first -> (n, A) actions to execute, and what is
+        remembered now: the policy's mode, or drawn where there is a generator."""
 
     def save(self, path: Path) -> None:
         """Write the policy as stable-baselines3 does."""

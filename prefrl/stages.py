@@ -335,7 +335,8 @@ def export_onnx(path: Path, to: Path, best: bool = False) -> None:
     Raises `RunError` for others.
     """
     from prefrl.improve.control import ControlLearner
-    from prefrl.policies.to_onnx import save_onnx
+    from prefrl.policies.mlp import MLPPolicy
+    from prefrl.policies.to_onnx import ACTIVATIONS, save_onnx
 
     if path.is_file():
         save_onnx(_zipped(path, best).actor(), to)
@@ -346,7 +347,11 @@ def export_onnx(path: Path, to: Path, best: bool = False) -> None:
             f"{path}: expected a run with learner.kind=control, and its policy is that of a {type(learner).__name__}; "
             "export it with --form sb3, and from there as stable-baselines3's documentation says"
         )
-    save_onnx(learner.policy.numpy_actor(), to)
+    policy = learner.policy
+    if not isinstance(policy, MLPPolicy) or policy.settings.activation not in ACTIVATIONS:
+        wanted = " or ".join(ACTIVATIONS)
+        raise RunError(f"{path}: expected learner.policy.kind=mlp with {wanted}; no other is written as ONNX")
+    save_onnx(policy.numpy_actor(), to)
 
 
 def export_sb3(folder: Path, to: Path, best: bool = False) -> int:

@@ -96,6 +96,13 @@ def test_a_fit_stays_on_the_device_of_its_reward_model(kind: str, options: dict[
     assert_same(values(there[2]), values(here[2]), ROUNDING)
 
 
+POLICIES: list[dict[str, Any]] = [
+    {"kind": "mlp", "hidden": (8,)},
+    {"kind": "cnn", "image": (1, 2, 1), "filters": [(4, 1, 1)], "width": 8},
+    {"kind": "gru", "width": 6, "hidden": 5, "chunk": 3},
+]
+
+
 def learned(settings: Any, task: Any, model: Any) -> tuple[Any, Any]:
     """The metrics and the state of a learner after a round of learning and an evaluation."""
     learner = settings.build(task, np.random.default_rng(0))
@@ -105,10 +112,11 @@ def learned(settings: Any, task: Any, model: Any) -> tuple[Any, Any]:
     return improved | evaluated.metrics, learner.state()
 
 
-def test_a_control_learner_keeps_to_its_device_and_learns_the_same_there() -> None:
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda policy: str(policy["kind"]))
+def test_a_control_learner_keeps_to_its_device_and_learns_the_same_there(policy: dict[str, Any]) -> None:
     kind: Any = settings_class("learners", "control")
     small = {"environments": 2, "steps_per_round": 16, "rollout_steps": 8, "epochs": 1, "critic_epochs": 1}
-    settings = kind(**small, minibatch=8, hidden=(8,), evaluation_episodes=2)
+    settings = kind(**small, minibatch=8, policy=policy, evaluation_episodes=2)
 
     def round_of(device: torch.device) -> tuple[Any, Any]:
         model = reward("mlp")

@@ -50,6 +50,14 @@ def _rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tuple[str
     for name, setting in described["properties"].items():
         if "$ref" in setting:
             yield from _rows(groups[_name(setting)], groups, f"{prefix}{name}.")
+        elif "oneOf" in setting:
+            of_kinds = {kind: groups[_name({"$ref": at})] for kind, at in setting["discriminator"]["mapping"].items()}
+            default = setting["default"]["kind"]
+            yield f"{prefix}{name}.kind", " | ".join(of_kinds), default, setting.get("description", "")
+            for kind, group in of_kinds.items():
+                own = {**group, "properties": {k: x for k, x in group["properties"].items() if k != "kind"}}
+                yield f"{prefix}{name}.kind={kind}", "", "", group.get("description", "")
+                yield from _rows(own, groups, f"  {prefix}{name}.")
         else:
             default = _default(setting, name in described.get("required", []))
             yield prefix + name, _type(setting, ", "), default, setting.get("description", "")

@@ -8,19 +8,20 @@ behaviour worth more?
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from prefrl.evaluate.card import Hindsight, Seen
 from prefrl.evaluate.win_rate import by_scores
-from prefrl.kinds import kind_of, named
+from prefrl.kinds import Arrays, kind_of, named
 from prefrl.protocols import RewardModel
 from prefrl.stats.estimates import Estimate, undefined
 from prefrl.stats.intervals import average, mean
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.storage.files import whole_folder
-from prefrl.types import C, Candidate, Floats
+from prefrl.types import C, Candidate, Floats, Json
 
 FOLDER, FILE = "evaluations", "hindsight.json"
 MOST = 4_000_000
@@ -30,7 +31,9 @@ MOST = 4_000_000
 def keep(folder: Path, number: int, candidates: Sequence[Candidate]) -> None:
     """Keep what a round's evaluation measured, in a run's folder. Gold and simulator states are left out."""
     kind = kind_of(candidates[0])
-    bodies, arrays, size = [], [], 0
+    bodies: list[Json] = []
+    arrays: list[Arrays] = []
+    size = 0
     for one in candidates:
         found = kind.arrays(kind.plain(one))
         size += sum(array.nbytes for array in found.values())
@@ -65,10 +68,8 @@ def read(folder: Path, number: int) -> list[C]:
     """What was kept of a round. Raises `DamagedError` where it is not as it was written."""
     state = load_state(_place(folder, number), "candidates")
     kind = named(state["kind"])
-    return [
-        kind.load(body, lambda arrays=arrays: arrays)
-        for body, arrays in zip(state["bodies"], state["arrays"], strict=True)
-    ]
+    pairs = zip(state["bodies"], state["arrays"], strict=True)
+    return [kind.load(body, partial(dict, arrays)) for body, arrays in pairs]
 
 
 def _won(scores: Floats, start: Floats, rng: np.random.Generator) -> Estimate:

@@ -2,35 +2,39 @@
 
 Variant: PPO's clip with GAE (Schulman et al. 2016, 2017), advantages whitened over the rollout, a learning rate steered
 by the KL in place of early stopping, and extra epochs for the critic after each fit of the reward. Values are not
-clipped; actor and critic share nothing but the observation normaliser.
+clipped. What actor and critic share is for the kind of policy to say (`learner.policy`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from torch import Tensor
 
-from prefrl.components import Settings, filled_in
+from prefrl.components import ConfigError, Settings, filled_in
 from prefrl.improve.gradient import Batch, adam_of, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
+from prefrl.policies.acting import Acting, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
+from prefrl.policies.cnn import CNNPolicySettings
+from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.loaded import Actor
-from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
-from prefrl.policies.rollout import Act, Rollout, collect, joined, learned_rewards, step_rewards
+from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of
-from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
+from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "ppo": {},
@@ -38,10 +42,25 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "reinforce": {"clip": None, "epochs": 1, "trace": 1.0},
 }
 """Where their defaults are others than those of the fields below."""
-
-
+MOVED = ("hidden", "initial_std")
+"""Settings that were the learner's own once, and are its policy's."""
 SLOWER = 0.3
 """What is left of the learning rate when a round was undone."""
+
+
+Read: TypeAlias = Callable[[Bools], Reading[Any]]
+"""A rollout as the policy reads it now; (n, T) of which steps it is to value what they led to."""
+
+
+def _of_some_kind(given: Any) -> Any:
+    return {"kind": "mlp"} | given if isinstance(given, dict) else given
+
+
+PolicySettings: TypeAlias = Annotated[
+    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings,
+    Field(discriminator="kind"),
+    BeforeValidator(_of_some_kind),
+]
 
 
 class ControlLearnerSettings(Settings):
@@ -84,10 +103,8 @@ class ControlLearnerSettings(Settings):
     rollback: float | None = Field(0.1, ge=0)
     """What share of all that was gained, by the newest reward, a round may lose before the policy goes back to the best
     one; null keeps whatever comes."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers, of the policy and of the critic."""
-    initial_std: float = Field(1.0, gt=0)
-    """Of the actions' noise at the start, in units of half the action bounds."""
+    policy: PolicySettings = MLPPolicySettings()
+    """The network that acts, and its critic."""
     start: Path | None = None
     """A run of control, or a zip of stable-baselines3, whose policy this one starts from, with its critic, its noise
     and its normaliser; from the working directory where it is relative. It needs the same widths and spaces."""
@@ -101,6 +118,9 @@ class ControlLearnerSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_in(cls, given: Any) -> Any:
+        moved = [name for name in MOVED if isinstance(given, dict) and name in given]
+        if moved:
+            raise ValueError("\n".join(f".{name}: this is now learner.policy.{name}; write it there" for name in moved))
         return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")
@@ -109,6 +129,17 @@ class ControlLearnerSettings(Settings):
             raise ValueError(
                 f"steps_per_round must be a multiple of environments, and at least twice it, "
                 f"got {self.steps_per_round} and {self.environments}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _plain_start(self) -> ControlLearnerSettings:
+        network = self.policy
+        plain = isinstance(network, MLPPolicySettings) and (network.activation, network.critic_hidden) == ("tanh", None)
+        if self.start is not None and not plain:
+            raise ValueError(
+                "start takes over a policy of kind mlp with tanh and one width for actor and critic: leave "
+                "learner.policy as it is, but for hidden"
             )
         return self
 
@@ -158,7 +189,7 @@ class ControlLearner:
     def __init__(self, settings: ControlLearnerSettings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
         self._player = Player(task, settings.environments)
-        self.policy = MLPPolicy(task, settings.hidden, settings.initial_std, rng)
+        self.policy: ControlPolicy[Any] = settings.policy.build(task, rng)
         self.policy.to(device_of(settings.device))
         self._optimizer = adam_of(self.policy, settings.learning_rate)
         self._span = 0.0, 0.0
@@ -181,13 +212,17 @@ class ControlLearner:
         """
         scorer, count = step_rewards(reward), self._settings.environments
         envs, rollouts, metrics = self._task.environments(count), [], []
-        observations = envs.reset(rng)
+        observations, memory, begins = envs.reset(rng), None, None
         lengths = self._rollout_lengths()
         for number, steps in enumerate(lengths):
-            rollout, observations = collect(envs, observations, steps, self._act(rng))
+            act = Acting(self._decide(), rng, memory)
+            rollout, observations = collect(envs, observations, steps, act, begins)
+            read = partial(self.policy.read, rollout, memory)
             # Only before the first rollout is the reward one that the critic has not seen.
-            metrics.append(self._learn(rollout, scorer, rng, number == 0, self._left(number / len(lengths))))
+            metrics.append(self._learn(rollout, read, scorer, rng, self._left(number / len(lengths)), number == 0))
             rollouts.append(rollout)
+            begins = rollout.ends[:, -1]
+            memory = forgotten(act.memory, begins)
         # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._player.learned_from(joined(rollouts))
         return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
@@ -221,16 +256,26 @@ class ControlLearner:
         self._span = begin, end
 
     def actor(self) -> Actor:
-        self._begin()
-        actor = self.policy.numpy_actor()
-        return lambda observations, rng: actor(observations, rng)[1]
+        decide = self._decide()
+
+        def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
+            _, actions, memory = decide(observations, rng, None, memory)
+            return actions, memory
+
+        return act
 
     def save(self, path: Path) -> None:
-        """As a zip of stable-baselines3's PPO, which acts as this policy does."""
+        """As a zip of stable-baselines3's PPO, which acts as this policy does. Raises ConfigError for kinds of policies
+        that it has not."""
+        if not isinstance(self.policy, MLPPolicy):
+            raise ConfigError(
+                "a zip of stable-baselines3's PPO can only hold a policy of kind mlp, and this one is of kind "
+                f"{self._settings.policy.kind}: act with it through prefrl.load_policy"
+            )
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
         self._begin()
-        save_ppo(self.policy, self._task, self._settings.hidden, path)
+        save_ppo(self.policy, self._task, path)
 
     def state(self) -> State:
         self._begin()
@@ -245,7 +290,8 @@ class ControlLearner:
     def _begin(self) -> None:
         """Take over the policy that this one starts from, once."""
         if self._start is not None:
-            self.policy.load(starting_state(self._start, self._task, self._settings.hidden))
+            assert isinstance(self._settings.policy, MLPPolicySettings)
+            self.policy.load(starting_state(self._start, self._task, self._settings.policy.hidden))
             self._start = None
 
     def _rollout_lengths(self) -> list[int]:
@@ -269,16 +315,16 @@ class ControlLearner:
         group["lr"] = steered
 
     def _learn(
-        self, rollout: Rollout, reward: StepRewardModel, rng: np.random.Generator, critic_first: bool, left: float
+        self, rollout: Rollout, read: Read, reward: StepRewardModel, rng: np.random.Generator, left: float, new: bool
     ) -> Metrics:
-        """Learn from one rollout, with what is `left` of the learning rate."""
+        """Learn from one rollout, with what is `left` of the learning rate; the critic first, of a `new` reward."""
         settings, objective = self._settings, self._settings.objective()
         rewards = learned_rewards(reward, rollout)
-        batch, explained = self._batch(rollout, rewards)
-        if critic_first and settings.critic_epochs:
+        batch, explained = self._batch(rollout, read, rewards)
+        if new and settings.critic_epochs:
             alone = replace(objective, policy=False)
             self._update(batch, settings.critic_epochs, alone, left, rng)
-            batch, explained = self._batch(rollout, rewards)  # advantages by the critic that knows the new reward
+            batch, explained = self._batch(rollout, read, rewards)  # advantages by the critic that knows the new reward
         steps = self._update(batch, settings.epochs, objective, left, rng)
         # Not before the update: actions were drawn under the old statistics, and the ratio must start at 1.
         self.policy.observe(rollout.observations)
@@ -293,54 +339,56 @@ class ControlLearner:
         return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
 
     def _update(
-        self, batch: Batch[Decisions], epochs: int, objective: Objective, left: float, rng: np.random.Generator
+        self, batch: Batch[Any], epochs: int, objective: Objective, left: float, rng: np.random.Generator
     ) -> list[Metrics]:
+        minibatches = self._minibatches(batch, epochs, rng)
         with self._slowed(left):
-            return update(self.policy, self._optimizer, batch, self._minibatches(len(batch), epochs, rng), objective)
+            return update(self.policy, self._optimizer, batch, minibatches, objective)
 
     @torch.no_grad()
-    def _batch(self, rollout: Rollout, rewards: Floats) -> tuple[Batch[Decisions], float]:
-        """What the update needs, B = n x T sequences of one step, and how much of the returns the critic explains."""
+    def _batch(self, rollout: Rollout, read: Read, rewards: Floats) -> tuple[Batch[Any], float]:
+        """What the update needs, in chunks of the policy's length, and how much of the returns the critic explains."""
         settings, policy = self._settings, self.policy
-        observations = self._tensor(policy.normalise(rollout.observations))
-        values = policy.values_of(observations)  # (n, T)
+        unseen = rollout.ends.copy()
+        unseen[:, -1] = True  # what follows a row's last step is in the next rollout
+        reading = read(unseen)
+        values = reading.values  # (n, T)
+        following = self._next_values(rollout, values, reading.final, unseen)
         ends = self._tensor(rollout.ends)
         scaled = self._tensor(rewards).float() * _scale(settings.discount)
-        advantages = gae(scaled, values, self._next_values(rollout, values), ends, settings.discount, settings.trace)
+        advantages = gae(scaled, values, following, ends, settings.discount, settings.trace)
         returns = advantages + values
         # The clamp: returns that do not vary leave nothing to explain.
         explained = 1.0 - float(advantages.var() / returns.var().clamp(min=1e-12))
         # Whitened only now: the critic's targets above are in the units of the reward.
         white = masked_whiten(advantages, torch.ones_like(advantages))
-        # (n, T, .) -> (B, .), in the order that view(-1, 1) gives the other columns below.
-        legal = None if rollout.legal is None else self._tensor(rollout.legal).flatten(0, 1)
-        decisions = Decisions(observations.flatten(0, 1), self._tensor(rollout.choices).flatten(0, 1), legal)
         # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
-        logp, _ = policy.log_prob(decisions)
-        return Batch(decisions, logp, white.view(-1, 1), returns.view(-1, 1)), explained
+        logp, _ = policy.log_prob(reading.inputs)
+        return Batch(reading.inputs, logp, in_chunks(white, policy.chunk), in_chunks(returns, policy.chunk)), explained
 
-    def _next_values(self, rollout: Rollout, values: Tensor) -> Tensor:
-        """(n, T): the value of what each step led to."""
-        unseen = rollout.ends.copy()
-        unseen[:, -1] = True  # what follows a row's last step is in the next rollout
-        final = self._tensor(self.policy.normalise(rollout.final_observations[unseen]))
+    def _next_values(self, rollout: Rollout, values: Tensor, final: Tensor, unseen: Bools) -> Tensor:
+        """(n, T): the value of what each step led to; `final` (k,) are those that were `unseen` (n, T)."""
         # After an end the next column belongs to another episode, so the final observation is valued by itself. The
         # column that fills up the end of each row is among those replaced.
         following = torch.cat([values[:, 1:], values[:, :1]], 1)
-        following[self._tensor(unseen)] = self.policy.values_of(final)
+        following[self._tensor(unseen)] = final
         return following * ~self._tensor(rollout.terminated)  # a time limit still has a future
 
-    def _minibatches(self, size: int, epochs: int, rng: np.random.Generator) -> list[Tensor]:
-        parts = max(1, round(size / self._settings.minibatch))
+    def _minibatches(self, batch: Batch[Any], epochs: int, rng: np.random.Generator) -> list[Tensor]:
+        """Rows of the batch, in each minibatch those of about as many steps as the settings say."""
+        size = len(batch)
+        parts = min(size, max(1, round(int(batch.inputs.mask.sum()) / self._settings.minibatch)))
         orders = [self._tensor(rng.permutation(size)) for _ in range(epochs)]
         # tensor_split leaves no small remainder, whose gradient would be mostly noise.
         return [rows for order in orders for rows in order.tensor_split(parts)]
 
-    def _act(self, rng: np.random.Generator | None) -> Act:
-        """The policy's choices, drawn from `rng`, or its mode."""
+    def _act(self, rng: np.random.Generator | None) -> Acting:
+        """The policy's choices, drawn from `rng`, or its mode; in episodes that are yet to begin."""
+        return Acting(self._decide(), rng)
+
+    def _decide(self) -> Decide:
         self._begin()
-        actor = self.policy.numpy_actor()
-        return lambda observations, legal: actor(observations, rng, legal)
+        return self.policy.decide()
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         """An array on the policy's device."""

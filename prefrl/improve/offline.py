@@ -8,7 +8,7 @@ observation normaliser is that of the segments it was cloned from.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Self, TypeAlias
 
@@ -25,8 +25,9 @@ from prefrl.improve.gradient import adam_of, descend_by_logp
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import Player
 from prefrl.kinds import SEGMENTS
+from prefrl.policies.acting import Decisions
 from prefrl.policies.loaded import Actor
-from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask, Recorded, RewardModel, Store
 from prefrl.seeding import Device, device_of
@@ -127,7 +128,8 @@ class Offline:
     ) -> None:
         self._settings, self._task, self._improve = settings, task, improve
         self._discount, self._alpha = discount, alpha
-        self.policy = MLPPolicy(task, settings.hidden, settings.std, rng, learns_std=False)
+        network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
+        self.policy = MLPPolicy(network, task, rng, learns_std=False)
         self.policy.to(device_of(settings.device))
         self.optimizer = adam_of(self.policy, settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
@@ -172,7 +174,7 @@ class Offline:
         if isinstance(self._task, Recorded):
             return Evaluation({"gold": float("nan")} | self._measured)
         found = self._player.evaluate(self._settings.evaluation_episodes, self._act(None), reward, rng)
-        return Evaluation(found.metrics | self._measured, found.examples, found.notes)
+        return replace(found, metrics=found.metrics | self._measured)
 
     def scores(self, logp: Tensor, whose: Integers, before: Integers) -> Tensor:
         """(S, 1) log-probabilities of segments' steps -> (N,) their discounted sums, each step's against the mode's.
@@ -185,13 +187,13 @@ class Offline:
 
     def actor(self) -> Actor:
         actor = self.policy.numpy_actor()
-        return lambda observations, rng: actor(observations, rng)[1]
+        return lambda observations, rng, memory: (actor(observations, rng)[1], memory)
 
     def save(self, path: Path) -> None:
         """As a zip of stable-baselines3's PPO, which acts as this policy does."""
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
-        save_ppo(self.policy, self._task, self._settings.hidden, path)
+        save_ppo(self.policy, self._task, path)
 
     def state(self) -> State:
         learned = {"policy": self.policy.state(), "optimizer": self.optimizer.state_dict()}
@@ -204,7 +206,7 @@ class Offline:
         self._player.load(state)
 
     def _clone(self, segments: Sequence[Segment], rng: np.random.Generator) -> Metrics:
-        if self.policy.count:
+        if self.policy.normaliser.count:
             return {}
         self.policy.observe(np.concatenate([one.observations for one in segments]))
         steps, settings = Recordings.of(segments, self.policy).decisions, self._settings
@@ -242,7 +244,7 @@ class Offline:
 
     def _act(self, rng: np.random.Generator | None) -> Act:
         actor = self.policy.numpy_actor()
-        return lambda observations, legal: actor(observations, rng, legal)
+        return lambda observations, legal, begins: actor(observations, rng, legal)
 
 
 def minibatches(count: int, epochs: int, size: int, rng: np.random.Generator) -> Iterator[Integers]:

@@ -27,6 +27,7 @@ from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
 from prefrl.improve.replay import cut, load_replay, relabel, replay_state
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
+from prefrl.policies.acting import Memory
 from prefrl.policies.loaded import Actor
 from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
@@ -252,7 +253,11 @@ class SB3:
         self._end = end
 
     def actor(self) -> Actor:
-        return lambda observations, rng: self._act(deterministic=rng is None)(observations, None)[1]
+        def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
+            fresh = np.zeros(len(observations), bool)
+            return self._act(deterministic=rng is None)(observations, None, fresh)[1], memory
+
+        return act
 
     def save(self, path: Path) -> None:
         """As stable-baselines3 saves it: `SAC.load` and its like read it."""
@@ -318,7 +323,7 @@ class SB3:
     def _random(self, rng: np.random.Generator) -> Act:
         space = self.model.action_space
 
-        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+        def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
             if self._env.discrete:
                 chosen: np.ndarray = rng.integers(space.n, size=len(observations))
             else:
@@ -329,7 +334,7 @@ class SB3:
         return act
 
     def _act(self, deterministic: bool) -> Act:
-        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+        def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
             chosen, _ = self.model.predict(observations, deterministic=deterministic)
             actions = executed(self._env.action_space, chosen)
             return actions, actions

@@ -18,17 +18,20 @@ from prefrl.protocols import ControlTask
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats
 
+ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "silu": torch.nn.SiLU}
 
-def save_ppo(policy: MLPPolicy, task: ControlTask, hidden: tuple[int, ...], path: Path) -> None:
+
+def save_ppo(policy: MLPPolicy, task: ControlTask, path: Path) -> None:
     """Write what `PPO.load` reads.
 
     The observation's normaliser is folded into the first layers and the bounds' box into the actor's last, since PPO
     has neither. Two things are lost: our clip of observations at 10 standard deviations, and Adam's moments.
     """
-    settings: dict[str, Any] = {"net_arch": {"pi": list(hidden), "vf": list(hidden)}, "activation_fn": torch.nn.Tanh}
+    widths = {"pi": list(policy.widths["actor"]), "vf": list(policy.widths["critic"])}
+    settings: dict[str, Any] = {"net_arch": widths, "activation_fn": ACTIVATIONS[policy.settings.activation]}
     model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings)
     model.observation_space = model.policy.observation_space = _observations(task, model.observation_space)
-    model.policy.load_state_dict(_folded(policy, len(hidden)))
+    model.policy.load_state_dict(_folded(policy))
     model.save(path)
 
 
@@ -43,15 +46,16 @@ def _observations(task: ControlTask, plain: Space[Any]) -> Space[Any]:
     return plain
 
 
-def _folded(policy: MLPPolicy, hidden: int) -> dict[str, Tensor]:
+def _folded(policy: MLPPolicy) -> dict[str, Tensor]:
     """PPO's state, worked out in float64."""
     named: dict[str, Floats] = {k: to_numpy(p).astype(np.float64) for k, p in policy.named().items()}
-    scale = 1.0 / np.sqrt(policy.variance + 1e-8)
+    mean, scale = policy.normaliser.mean, policy.normaliser.scale
     found: dict[str, Floats] = {}
     for net, body, head in (("actor", "policy_net", "action_net"), ("critic", "value_net", "value_net")):
+        hidden = len(policy.widths[net])
         layers = [(named[f"{net}_{2 * i}"], named[f"{net}_{2 * i + 1}"]) for i in range(hidden + 1)]
         weight, bias = layers[0]
-        layers[0] = weight * scale, bias - weight @ (policy.mean * scale)
+        layers[0] = weight * scale, bias - weight @ (mean * scale)
         if net == "actor" and policy.space.middle is not None and policy.space.half is not None:
             weight, bias = layers[-1]
             half = policy.space.half.astype(np.float64)

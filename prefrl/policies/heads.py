@@ -1,6 +1,6 @@
-"""What a small network's outputs say of choices, and the gradient of the outputs, by hand in NumPy.
+"""What a small network's outputs say of choices: drawn from, their log-probabilities, and the gradient by hand.
 
-`MLPPolicy.log_prob` says the same in torch; tests hold one against the other.
+`density` is in torch, `Gaussian` and `Categorical` say the same in NumPy; tests hold one against the other.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from prefrl.protocols import ControlTask
 from prefrl.types import Bools, Floats
 
 ILLEGAL = -1e9
@@ -20,6 +23,93 @@ logarithm is 0 as well, where minus infinity would make NaN of it."""
 
 Slopes: TypeAlias = tuple[Floats, Floats | None]
 """The gradients of the outputs (B, A), and of the log standard deviations (A,) where there are any."""
+
+
+@dataclass(frozen=True)
+class ActionSpace:
+    """How a policy's choices become actions: one-hot, or the bounds' box scaled to [-1, 1] and clipped."""
+
+    size: int
+    middle: Floats | None = None
+    """(A,), None where actions are discrete."""
+    half: Floats | None = None
+    clip: Floats | None = None
+    """(A,): 1 where there are bounds, infinity elsewhere."""
+
+    @classmethod
+    def of(cls, task: ControlTask) -> ActionSpace:
+        return cls.within(task.action_size, task.action_bounds)
+
+    @classmethod
+    def within(cls, size: int, bounds: tuple[Floats, Floats] | None) -> ActionSpace:
+        """Of actions of that size within low (A,) and high (A,), or discrete ones where there are no bounds."""
+        if bounds is None:
+            return cls(size)
+        low, high = (np.asarray(b, np.float32) for b in bounds)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        # What has no bounds has no scale either: there the choice is the action.
+        low, high = np.where(bounded, low, -1), np.where(bounded, high, 1)  # the sum of infinities is none
+        middle, half = ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32)
+        return cls(size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
+
+    @property
+    def discrete(self) -> bool:
+        return self.middle is None
+
+    def execute(self, choices: Floats) -> Floats:
+        """(..., A) -> (..., A): what the environment is given."""
+        if self.middle is None or self.half is None or self.clip is None:
+            return choices
+        # The log-probability is that of the choice before the clip, which is part of the world like the simulator.
+        return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
+
+    def choices(self, actions: Floats) -> Floats:
+        """(..., A) actions that were executed -> (..., A) float32 choices that lead to them."""
+        if self.middle is None or self.half is None:
+            return actions
+        found: Floats = ((actions - self.middle) / self.half).astype(np.float32)
+        return found
+
+
+def choose(
+    space: ActionSpace, outputs: Floats, std: Floats | None, rng: np.random.Generator | None, legal: Bools | None
+) -> tuple[Floats, Floats]:
+    """Outputs (n, A) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None.
+
+    `std` (A,): of the noise, None where actions are discrete. `legal` (n, A): which of these there are; the others are
+    not chosen.
+    """
+    if std is None:
+        outputs = outputs if legal is None else np.where(legal, outputs, -np.inf)
+        # The largest of logits plus Gumbel noise is a draw from their softmax.
+        noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
+        choices = np.eye(space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
+        return choices, choices
+    if rng is not None:
+        outputs += std * rng.standard_normal(outputs.shape, np.float32)
+    return outputs, space.execute(outputs)
+
+
+def density(outputs: Tensor, choices: Tensor, log_std: Tensor | None, legal: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Log-probabilities (..., 1) and entropies (..., 1), in nats, of choices (..., A).
+
+    `log_std` (A,), None where actions are discrete; `legal` (..., A) which of these there were, None where all.
+    """
+    if log_std is None:
+        outputs = outputs if legal is None else outputs.masked_fill(~legal, ILLEGAL)
+        every = outputs.log_softmax(-1)
+        logp = (every * choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
+        return logp, -(every.exp() * every).sum(-1, keepdim=True)
+    scaled = (choices - outputs) * (-log_std).exp()
+    constant = log_std.sum() + 0.5 * len(log_std) * math.log(2 * math.pi)
+    entropy = constant + 0.5 * len(log_std)
+    # A Gaussian's entropy hangs on its std alone, which is the same in every state.
+    return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(*outputs.shape[:-1], 1)
+
+
+def starting_std(space: ActionSpace, initial: float) -> dict[str, Tensor]:
+    """The log standard deviations that a policy learns, in half the action bounds; none where actions are discrete."""
+    return {} if space.discrete else {"log_std": torch.full((space.size,), math.log(initial))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,4 +193,4 @@ class Categorical:
         return found, None
 
 
-__all__ = ["ILLEGAL", "Categorical", "Gaussian", "Slopes"]
+__all__ = ["ILLEGAL", "ActionSpace", "Categorical", "Gaussian", "Slopes", "choose", "density", "starting_std"]

@@ -10,12 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from prefrl.components import ConfigError
+from prefrl.policies.acting import Acting, Memory, forgotten
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask
 from prefrl.types import Bools, Floats
 
-Actor: TypeAlias = Callable[[Floats, np.random.Generator | None], Floats]
-"""(n, O) observations -> (n, A) actions to execute: the policy's mode, or drawn where there is a generator."""
+Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[Floats, Memory]]
+"""(n, O) observations and what is remembered of each episode -> (n, A) actions to execute, and what is remembered now:
+the policy's mode, or drawn where there is a generator."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,15 @@ class Loaded:
     discrete: bool
 
     def act(self, rng: np.random.Generator | None) -> Act:
-        """For rollouts: what is drawn from `rng`, or the policy's mode."""
+        """For rollouts: what is drawn from `rng`, or the policy's mode; in episodes that are yet to begin."""
 
-        def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
-            actions = self.actor(observations, rng)
-            return actions, actions
+        def decide(
+            observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
+        ) -> tuple[Floats, Floats, Memory]:
+            actions, memory = self.actor(observations, rng, memory)
+            return actions, actions, memory
 
-        return act
+        return Acting(decide, rng)
 
     def check(self, task: ControlTask, name: str) -> None:
         """Raises `ConfigError` for a task of other spaces; `name` says whose policy this is."""
@@ -49,15 +53,16 @@ class Loaded:
     def predict(
         self,
         observation: npt.ArrayLike,
-        state: None = None,
+        state: Memory = None,
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
-    ) -> tuple[npt.NDArray[Any], None]:
-        """(O,) or (n, O) raw observations -> actions (A,) or (n, A), whole numbers where they are discrete; and None.
+    ) -> tuple[npt.NDArray[Any], Memory]:
+        """(O,) or (n, O) raw observations -> actions (A,) or (n, A), whole numbers where they are discrete.
 
-        `rng`: what is drawn from where the policy is not `deterministic`. `state` and `episode_start` are there for
-        those who pass them on: this policy has no memory. Raises ValueError for observations of another size.
+        And what the policy remembers, to be passed on as the next call's `state`; None of one without a memory.
+        `episode_start` (n,): for whom nothing before counts. `rng`: what is drawn from where the policy is not
+        `deterministic`. Raises ValueError for observations of another size.
         """
         rows = np.atleast_2d(np.asarray(observation, np.float32))
         if rows.ndim != 2 or rows.shape[1] != self.observation_size:
@@ -66,9 +71,11 @@ class Loaded:
                 f"observations must be ({self.observation_size},) or (n, {self.observation_size}), got {shape}"
             )
         drawn = None if deterministic else rng or np.random.default_rng()
-        actions = self.actor(rows, drawn)
+        if episode_start is not None:
+            state = forgotten(state, np.atleast_1d(np.asarray(episode_start, bool)))
+        actions, state = self.actor(rows, drawn, state)
         found = actions.argmax(1) if self.discrete else actions
-        return (found[0] if np.ndim(observation) == 1 else found), None
+        return (found[0] if np.ndim(observation) == 1 else found), state
 
 
 def _told(seen: int, acts: int, discrete: bool) -> str:

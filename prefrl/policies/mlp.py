@@ -6,97 +6,40 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from prefrl.policies.heads import ILLEGAL, Categorical, Gaussian
-from prefrl.policies.perceptron import Layers, backward, forward
+from prefrl.components import Settings
+from prefrl.policies.acting import Decide, Decisions, Memory, Reading, copy_into
+from prefrl.policies.heads import ActionSpace, Categorical, Gaussian, choose, density, starting_std
+from prefrl.policies.normaliser import Normaliser, Scaling
+from prefrl.policies.perceptron import Activation, Layers, activated, backward, forward
+from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask, PassByHand
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, State
 
-STEADY = 2.0
-"""By how much the scale of an input may change at once for the first layers to follow it."""
-CLIP = 10.0
-"""Normalised observations are clipped to this many standard deviations."""
 
+class MLPPolicySettings(Settings):
+    """Two perceptrons, an actor and a critic: for observations that say all there is to know."""
 
-@dataclass(frozen=True)
-class ActionSpace:
-    """How a policy's choices become actions: one-hot, or the bounds' box scaled to [-1, 1] and clipped."""
+    kind: Literal["mlp"] = "mlp"
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
+    """Widths of the hidden layers of the actor, and of the critic unless it has its own."""
+    critic_hidden: tuple[Annotated[int, Field(ge=1)], ...] | None = None
+    """Widths of the critic's hidden layers; null for those of the actor."""
+    activation: Activation = "tanh"
+    """What follows each hidden layer."""
+    initial_std: float = Field(1.0, gt=0)
+    """Of the actions' noise at the start, in units of half the action bounds."""
 
-    size: int
-    middle: Floats | None = None
-    """(A,), None where actions are discrete."""
-    half: Floats | None = None
-    clip: Floats | None = None
-    """(A,): 1 where there are bounds, infinity elsewhere."""
-
-    @classmethod
-    def of(cls, task: ControlTask) -> ActionSpace:
-        return cls.within(task.action_size, task.action_bounds)
-
-    @classmethod
-    def within(cls, size: int, bounds: tuple[Floats, Floats] | None) -> ActionSpace:
-        """Of actions of that size within low (A,) and high (A,), or discrete ones where there are no bounds."""
-        if bounds is None:
-            return cls(size)
-        low, high = (np.asarray(b, np.float32) for b in bounds)
-        bounded = np.isfinite(low) & np.isfinite(high)
-        # What has no bounds has no scale either: there the choice is the action.
-        low, high = np.where(bounded, low, -1), np.where(bounded, high, 1)  # the sum of infinities is none
-        middle, half = ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32)
-        return cls(size, middle, half, np.where(bounded, 1.0, np.inf).astype(np.float32))
-
-    @property
-    def discrete(self) -> bool:
-        return self.middle is None
-
-    def execute(self, choices: Floats) -> Floats:
-        """(..., A) -> (..., A): what the environment is given."""
-        if self.middle is None or self.half is None or self.clip is None:
-            return choices
-        # The log-probability is that of the choice before the clip, which is part of the world like the simulator.
-        return self.middle + self.half * np.clip(choices, -self.clip, self.clip)
-
-    def choices(self, actions: Floats) -> Floats:
-        """(..., A) actions that were executed -> (..., A) float32 choices that lead to them."""
-        if self.middle is None or self.half is None:
-            return actions
-        found: Floats = ((actions - self.middle) / self.half).astype(np.float32)
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class Decisions:
-    """B decisions, each a sequence of one step to the update."""
-
-    observations: Tensor
-    """(B, O) normalised."""
-    choices: Tensor
-    """(B, A)."""
-    legal: Tensor | None = None
-    """(B, A) bool: which discrete actions there were; None where there were all."""
-
-    @property
-    def mask(self) -> Tensor:
-        """(B, 1): all real."""
-        return self.choices.new_ones(len(self.choices), 1, dtype=torch.bool)
-
-    def rows(self, at: Tensor) -> Decisions:
-        return Decisions(self.observations[at], self.choices[at], None if self.legal is None else self.legal[at])
-
-    def order(self) -> Tensor:
-        return torch.arange(len(self.choices), device=self.choices.device)
-
-    def columns(self) -> dict[str, npt.NDArray[Any]]:
-        """The same in NumPy."""
-        found = {"observations": to_numpy(self.observations), "choices": to_numpy(self.choices)}
-        return found if self.legal is None else found | {"legal": to_numpy(self.legal)}
+    def build(self, task: ControlTask, rng: np.random.Generator) -> MLPPolicy:
+        return MLPPolicy(self, task, rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,39 +48,17 @@ class NumpyActor:
 
     space: ActionSpace
     layers: Layers
+    activation: Activation
     std: Floats | None
     """(A,) of the noise; None where actions are discrete."""
-    mean: Floats
-    scale: Floats
-    """(O,) of the normaliser: what is taken off, and what the rest is multiplied by."""
-    clip: float = CLIP
-    """Standard deviations."""
-
-    def normalise(self, observations: Floats) -> Floats:
-        """(..., O) -> (..., O) float32."""
-        scaled = (observations - self.mean) * self.scale
-        # A state far outside of what was seen would otherwise saturate the first layer.
-        return np.minimum(
-            np.maximum(scaled, -self.clip, out=scaled), self.clip, out=scaled
-        )  # np.clip, in half its time
+    scaling: Scaling
 
     def __call__(
         self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
     ) -> tuple[Floats, Floats]:
-        """(n, O) -> choices (n, A) and actions to execute (n, A); the mode where `rng` is None.
-
-        `legal` (n, A): which discrete actions there are; the others are not chosen.
-        """
-        outputs, _ = forward(self.normalise(observations), self.layers, "tanh")
-        if self.std is None:
-            outputs = outputs if legal is None else np.where(legal, outputs, -np.inf)
-            # The largest of logits plus Gumbel noise is a draw from their softmax.
-            noise = 0.0 if rng is None else rng.gumbel(size=outputs.shape)
-            choices = np.eye(self.space.size, dtype=np.float32)[(outputs + noise).argmax(1)]
-            return choices, choices
-        if rng is not None:
-            outputs += self.std * rng.standard_normal(outputs.shape, np.float32)
-        return outputs, self.space.execute(outputs)
+        """(n, O) -> choices (n, A) and actions to execute (n, A), as `choose` does."""
+        outputs, _ = forward(self.scaling(observations), self.layers, self.activation)
+        return choose(self.space, outputs, self.std, rng, legal)
 
 
 class Views(NamedTuple):
@@ -150,7 +71,7 @@ class Views(NamedTuple):
 
 
 class MLPPolicy:
-    """A `prefrl.protocols.Policy` of `Decisions`: an actor and a critic, each an MLP with tanh.
+    """A `prefrl.protocols.Policy` of `Decisions`: an actor and a critic, each an MLP.
 
     For boxes the log standard deviation is a parameter of its own, the same in every state.
 
@@ -159,29 +80,25 @@ class MLPPolicy:
     is the gradient (`by_hand`): for networks this small torch's overhead would be most of the time.
     """
 
+    chunk = 1
+
     def __init__(
-        self,
-        task: ControlTask,
-        hidden: tuple[int, ...],
-        initial_std: float,
-        rng: np.random.Generator,
-        learns_std: bool = True,
-    ):
+        self, settings: MLPPolicySettings, task: ControlTask, rng: np.random.Generator, learns_std: bool = True
+    ) -> None:
         """`learns_std`: false where the standard deviation stays what it is at first."""
         self._learns_std = learns_std
-        self.space = ActionSpace.of(task)
+        self.settings, self.space = settings, ActionSpace.of(task)
         size, order = task.observation_size, generator(rng)
-        nets = {"actor": _mlp((size, *hidden, task.action_size), 0.01, order)}
-        nets["critic"] = _mlp((size, *hidden, 1), 1.0, order)
+        of_critic = settings.hidden if settings.critic_hidden is None else settings.critic_hidden
+        self.widths = {"actor": settings.hidden, "critic": of_critic}
+        nets = {"actor": _mlp((size, *self.widths["actor"], task.action_size), 0.01, order)}
+        nets["critic"] = _mlp((size, *self.widths["critic"], 1), 1.0, order)
         named = {f"{net}_{i}": p for net, parameters in nets.items() for i, p in enumerate(parameters)}
-        if not self.space.discrete:
-            named["log_std"] = torch.full((task.action_size,), math.log(initial_std))
+        named |= starting_std(self.space, settings.initial_std)
         self._shapes = {name: p.shape for name, p in named.items()}
         self._flat = torch.nn.Parameter(torch.cat([p.flatten() for p in named.values()]))
         self.to(self.device)
-        self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
-        self.raw = False
-        """Whether observations are seen as they are, for good: by a policy that learned without a normaliser."""
+        self.normaliser = Normaliser(size)
 
     @property
     def device(self) -> torch.device:
@@ -199,69 +116,47 @@ class MLPPolicy:
 
     def normalise(self, observations: Floats) -> Floats:
         """(..., O) -> (..., O) float32, by the statistics so far."""
-        return self.numpy_actor().normalise(observations)
+        return self.normaliser.now()(observations)
 
     def observe(self, observations: Floats) -> None:
-        """Add observations (..., O) to the normaliser's statistics (Chan et al. 1979).
-
-        The first layers change with it, so that what the policy does stays the same (as Pop-Art does for outputs, van
-        Hasselt et al. 2016): a mean that moved by a fifth of a standard deviation has ruined policies. The first time
-        they do not, when weights are random and are to see inputs of one size. Never between acting and learning: the
-        probability ratio would not start at 1.
-        """
-        if self.raw:
-            return
-        mean, scale = self.mean, self._scale
-        # In float64: float32 sums lose small changes over many rounds.
-        new = observations.reshape(-1, observations.shape[-1]).astype(np.float64)
-        total = self.count + len(new)
-        delta = new.mean(0) - self.mean
-        squares = self.variance * self.count + new.var(0) * len(new) + delta**2 * self.count * len(new) / total
-        self.mean = self.mean + delta * len(new) / total
-        known, self.variance, self.count = self.count > 0, squares / total, total
-        if known:
-            self._keep(mean, scale)
-
-    @property
-    def _scale(self) -> Floats:
-        found: Floats = 1.0 / np.sqrt(self.variance + 1e-8)  # eps: some inputs never change
-        return found
-
-    @torch.no_grad()
-    def _keep(self, mean: Floats, scale: Floats) -> None:
-        """Make the first layers do on inputs by the new statistics what they did by these (O,)."""
-        ratio, shift = scale / self._scale, (self.mean - mean) * scale
-        # An input that hardly changed before was blown up, and clipped: its weights are not to become as large.
-        steady = (ratio > 1 / STEADY) & (ratio < STEADY)
-        ratio, shift = (np.where(steady, x, plain) for x, plain in ((ratio, 1.0), (shift, 0.0)))
-        parts = self._parts(self._flat.data)
-        by, moved = (torch.from_numpy(x).to(self._flat) for x in (ratio, shift))
-        for net in ("actor", "critic"):
-            weight, bias = parts[f"{net}_0"], parts[f"{net}_1"]
-            bias += moved @ weight
-            weight *= by[:, None]
+        """Add observations (..., O) to the normaliser's statistics, and let the first layers follow."""
+        move = self.normaliser.observe(observations)
+        if move is not None:
+            parts = self._parts(self._flat.data)
+            for net in ("actor", "critic"):
+                move.fold(parts[f"{net}_0"], parts[f"{net}_1"])
 
     def numpy_actor(self) -> NumpyActor:
         """What acts as the policy does now; it is not to be kept while the policy learns."""
         weights = self._views(self._flat)
         std = None if weights.log_std is None else np.exp(weights.log_std)
-        mean, scale = self.mean.astype(np.float32), self._scale.astype(np.float32)
-        return NumpyActor(self.space, weights.actor, std, mean, scale, np.inf if self.raw else CLIP)
+        return NumpyActor(self.space, weights.actor, self.settings.activation, std, self.normaliser.now())
+
+    def decide(self) -> Decide:
+        actor = self.numpy_actor()
+
+        def decide(
+            observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
+        ) -> tuple[Floats, Floats, Memory]:
+            return *actor(observations, rng, legal), memory
+
+        return decide
+
+    @torch.no_grad()
+    def read(self, rollout: Rollout, memory: Memory, asked: Bools) -> Reading[Decisions]:
+        normalise = self.normaliser.now()
+        observations = torch.from_numpy(normalise(rollout.observations)).to(self.device)
+        final = torch.from_numpy(normalise(rollout.final_observations[asked])).to(self.device)
+        values = self.values_of(observations), self.values_of(final)
+        return Reading(Decisions.of(rollout, observations), *values)
 
     def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
         outputs = self._outputs("actor", inputs.observations)
-        if self.space.discrete:
-            outputs = outputs if inputs.legal is None else outputs.masked_fill(~inputs.legal, ILLEGAL)
-            every = outputs.log_softmax(-1)
-            logp = (every * inputs.choices).sum(-1, keepdim=True)  # one-hot: picks the chosen one
-            return logp, -(every.exp() * every).sum(-1, keepdim=True)
-        log_std = self.named()["log_std"] if self._learns_std else self.named()["log_std"].detach()
-        scaled = (inputs.choices - outputs) * (-log_std).exp()
-        constant = log_std.sum() + 0.5 * self.space.size * math.log(2 * math.pi)
-        entropy = constant + 0.5 * self.space.size
-        # A Gaussian's entropy hangs on its std alone, which is the same in every state.
-        return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(len(outputs), 1)
+        log_std = self.named().get("log_std")
+        if log_std is not None and not self._learns_std:
+            log_std = log_std.detach()
+        return density(outputs, inputs.choices, log_std, inputs.legal)
 
     @property
     def peak(self) -> float:
@@ -289,11 +184,11 @@ class MLPPolicy:
         observations, traces = inputs["observations"], []
         weights, head, values = self._weights, None, None
         if actor:
-            outputs, trace = forward(observations, weights.actor, "tanh")
+            outputs, trace = forward(observations, weights.actor, self.settings.activation)
             head = self._head(outputs, inputs)
             traces.append(trace)
         if critic:
-            values, trace = forward(observations, weights.critic, "tanh")
+            values, trace = forward(observations, weights.critic, self.settings.activation)
             traces.append(trace)
 
         def pull_back(of_logp: Floats | None, of_entropy: float, of_values: Floats | None) -> None:
@@ -302,30 +197,22 @@ class MLPPolicy:
                 self._gradient.zero_()
             if head is not None and of_logp is not None:
                 of_outputs, of_std = head.slopes(of_logp, of_entropy)
-                backward(of_outputs, weights.actor, traces[0], "tanh", slopes.actor)
+                backward(of_outputs, weights.actor, traces[0], self.settings.activation, slopes.actor)
                 if slopes.log_std is not None:
                     slopes.log_std[:] = of_std if self._learns_std else 0.0
             if of_values is not None:
-                backward(of_values, weights.critic, traces[-1], "tanh", slopes.critic)
+                backward(of_values, weights.critic, traces[-1], self.settings.activation, slopes.critic)
 
         logp, entropies = head.log_prob() if head else (None, None)
         return PassByHand(logp, entropies, values, pull_back)
 
     def state(self) -> State:
-        named = {name: p.detach().clone() for name, p in self.named().items()}
-        found = {"parameters": named, "mean": self.mean, "variance": self.variance, "count": self.count}
-        return found | {"raw": True} if self.raw else found
+        return {"parameters": {name: p.detach().clone() for name, p in self.named().items()}} | self.normaliser.state()
 
-    @torch.no_grad()
     def load(self, state: State) -> None:
         """Raises ValueError where shapes differ."""
-        for name, parameter in self.named().items():
-            if state["parameters"][name].shape != parameter.shape:
-                found, expected = tuple(state["parameters"][name].shape), tuple(parameter.shape)
-                raise ValueError(f"policy: {name} has shape {found}, expected {expected}: other settings or task")
-            parameter.copy_(state["parameters"][name])  # in place: the optimiser holds this very memory
-        self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
-        self.raw = state.get("raw", False)
+        copy_into(self.named(), state["parameters"])
+        self.normaliser.load(state)
 
     def named(self) -> dict[str, Tensor]:
         """Every weight by its name, as torch lays layers out, (out, in) and (out,): views of what learns."""
@@ -356,7 +243,7 @@ class MLPPolicy:
         parameters = self.named()
         *hidden, last_weight, last_bias = (parameters[name] for name in self._names(net))
         for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
-            x = torch.tanh(torch.nn.functional.linear(x, weight, bias))
+            x = activated(torch.nn.functional.linear(x, weight, bias), self.settings.activation)
         return torch.nn.functional.linear(x, last_weight, last_bias)
 
 

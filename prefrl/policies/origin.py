@@ -11,7 +11,7 @@ import yaml
 from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
-from prefrl.policies.mlp import ActionSpace
+from prefrl.policies.heads import ActionSpace
 from prefrl.policies.zips import Bounds, read_zip, state_of
 from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.checkpoints import load_state, newest
@@ -81,7 +81,7 @@ def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]
     if widths[0] != tuple(hidden):
         raise ConfigError(
             f"learner.start: expected hidden layers of {list(hidden)}, and those of {path} are {list(widths[0])}: set "
-            f"learner.hidden={list(widths[0])}"
+            f"learner.policy.hidden={list(widths[0])}"
         )
 
 

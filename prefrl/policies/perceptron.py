@@ -66,6 +66,10 @@ _FUNCTIONS: dict[Activation, _Function] = {
 }
 
 
+def activated(x: Tensor, activation: Activation) -> Tensor:
+    return _FUNCTIONS[activation].torch(x)
+
+
 class Trace(NamedTuple):
     """What the gradient needs of a forward pass over S steps."""
 

@@ -12,9 +12,9 @@ from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel
 from prefrl.types import Bools, Floats, Segment, State
 
-Act: TypeAlias = Callable[[Floats, Bools | None], tuple[Floats, Floats]]
-"""(n, O) observations, and (n, A) which discrete actions are legal or None where all are -> (n, A) what the policy
-chose, and (n, A) what the environment is to execute."""
+Act: TypeAlias = Callable[[Floats, Bools | None, Bools], tuple[Floats, Floats]]
+"""(n, O) observations, (n, A) which discrete actions are legal or None where all are, and (n,) which episodes begin
+-> (n, A) what the policy chose, and (n, A) what the environment is to execute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +64,20 @@ def joined(parts: Sequence[Rollout]) -> Rollout:
     return Rollout(**whole)
 
 
-def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> tuple[Rollout, Floats]:
+def collect(
+    envs: Environments, observations: Floats, steps: int, act: Act, begins: Bools | None = None
+) -> tuple[Rollout, Floats]:
     """Act for `steps` steps from `observations` (n, O); also returns the observations to go on from.
 
-    Raises FloatingPointError where an observation or an action is not finite.
+    `begins` (n,): which episodes begin with the first step; None where all do. Raises FloatingPointError where an
+    observation or an action is not finite.
     """
     rows = []
+    begins = np.ones(len(observations), bool) if begins is None else begins
     for t in range(steps):
         # before the step: a segment shows the state in which each action was taken
         states, legal = envs.states(), envs.legal()
-        choices, actions = act(observations, legal)
+        choices, actions = act(observations, legal, begins)
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0][0])
             raise FloatingPointError(
@@ -86,7 +90,7 @@ def collect(envs: Environments, observations: Floats, steps: int, act: Act) -> t
         # The final ones: a reset in the same step would hide a simulation that went to infinity.
         if not np.isfinite(step.final_observations).all():
             raise FloatingPointError(_not_finite(step.final_observations, actions, t))
-        observations = step.observations
+        observations, begins = step.observations, step.terminated | step.truncated
     steps_ = [row[3] for row in rows]
     rollout = Rollout(
         observations=np.stack([row[0] for row in rows], 1),  # T x (n, O) -> (n, T, O)
@@ -127,7 +131,8 @@ def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Ge
     block = min(task.horizon, 100)
     while not done.all():
         steps = min(block, task.horizon - sum(p.ends.shape[1] for p in parts))
-        rollout, observations = collect(envs, observations, steps, act)
+        begins = parts[-1].ends[:, -1] if parts else None
+        rollout, observations = collect(envs, observations, steps, act, begins)
         parts.append(rollout)
         done |= rollout.ends.any(1)
     return joined(parts)

@@ -14,6 +14,8 @@ from prefrl.types import Floats
 OPSET, FORMAT = 17, 8
 """Of 2022, so that older runtimes read it as well; nothing newer is needed."""
 
+ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu"}
+
 
 def save_onnx(actor: NumpyActor, path: Path) -> None:
     """Write the policy's mode, with its normaliser and the box of its actions inside.
@@ -22,12 +24,13 @@ def save_onnx(actor: NumpyActor, path: Path) -> None:
     discrete action.
     """
     graph = _Graph()
-    last = graph.add("Mul", graph.add("Sub", "observations", actor.mean), actor.scale)
-    if np.isfinite(actor.clip):
-        last = graph.add("Clip", last, np.array(-actor.clip), np.array(actor.clip))
+    last = graph.add("Mul", graph.add("Sub", "observations", actor.scaling.mean), actor.scaling.scale)
+    if np.isfinite(actor.scaling.clip):
+        last = graph.add("Clip", last, np.array(-actor.scaling.clip), np.array(actor.scaling.clip))
     for number, (weight, bias) in enumerate(actor.layers):
-        last = graph.add("Gemm", last if number == 0 else graph.add("Tanh", last), weight, bias[0])
-    size, space = actor.mean.shape[0], actor.space
+        last = last if number == 0 else graph.add(ACTIVATIONS[actor.activation], last)
+        last = graph.add("Gemm", last, weight, bias[0])
+    size, space = actor.scaling.mean.shape[0], actor.space
     if space.middle is None or space.half is None or space.clip is None:
         graph.add("ArgMax", last, to="actions", axis=1, keepdims=0)
         output = helper.make_tensor_value_info("actions", TensorProto.INT64, ["n"])

@@ -19,8 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from prefrl.policies.heads import ActionSpace
 from prefrl.policies.loaded import Loaded
-from prefrl.policies.mlp import CLIP, ActionSpace, NumpyActor
+from prefrl.policies.mlp import NumpyActor
+from prefrl.policies.normaliser import CLIP, Scaling
 from prefrl.seeding import to_host, to_numpy
 from prefrl.types import Floats, Json, State
 
@@ -64,13 +66,14 @@ class Zipped:
         ]
         std = None if self.bounds is None else np.exp(named["log_std"])
         mean, scale = (x.astype(np.float32) for x in (state["mean"], 1.0 / np.sqrt(state["variance"] + 1e-8)))
-        return NumpyActor(self.space, layers, std, mean, scale, np.inf if self.normaliser is None else CLIP)
+        scaling = Scaling(mean, scale, np.inf if self.normaliser is None else CLIP)
+        return NumpyActor(self.space, layers, "tanh", std, scaling)
 
     def loaded(self) -> Loaded:
         """To act with."""
         actor = self.actor()
         return Loaded(
-            lambda observations, rng: actor(observations, rng)[1],
+            lambda observations, rng, memory: (actor(observations, rng)[1], memory),
             self.observation_size,
             self.space.size,
             self.space.discrete,

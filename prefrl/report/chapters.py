@@ -54,7 +54,7 @@ class Chapter:
 def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
     """All figures that the run can have: none of a text's drift where it measures none, none of gold where there is
     none, and once it is over none that is empty."""
-    found = (
+    found: tuple[Chapter, ...] = (
         Chapter("Did it help?", (*_learning(record, facts), *_drift(record, facts))),
         Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
         Chapter("How did it learn?", _training(record)),

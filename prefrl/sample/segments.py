@@ -79,7 +79,8 @@ def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.ra
     while len(parts) < passes or held < count:
         if len(parts) >= PATIENCE * OVERLAP * passes:
             raise ValueError(_too_short(task, sum(p.ends.size for p in parts), held, count, longest))
-        rollout, observations = collect(envs, observations, task.horizon, act)
+        begins = parts[-1].ends[:, -1] if parts else None
+        rollout, observations = collect(envs, observations, task.horizon, act, begins)
         parts.append(rollout)
         ages = _ages(rollout.ends, age)
         held += int((ages >= task.segment_steps).sum())  # so many windows end here

@@ -65,11 +65,12 @@ def average(values: Floats, what: str = "candidates") -> Estimate:
     """The mean of values (n,), with Student's interval; without one where there are fewer than two."""
     if not len(values):
         return undefined("nothing was scored")
-    found = Estimate(value=float(values.mean()), count=len(values))
+    centre = float(values.mean())
+    found = Estimate(value=centre, count=len(values))
     error = float(stats.sem(values)) if len(values) > 1 else 0.0
     if not error:
         return found.model_copy(update={"how": "no interval: there is no spread"})
-    low, high = stats.t.interval(0.95, len(values) - 1, found.value, error)
+    low, high = stats.t.interval(0.95, len(values) - 1, centre, error)
     return found.model_copy(
         update={"low": float(low), "high": float(high), "how": f"Student over {len(values)} {what}"}
     )

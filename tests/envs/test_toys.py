@@ -7,7 +7,7 @@ import pytest
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.envs.toys import INK, MARK, PointSettings
+from prefrl.envs.toys import INK, MARK, PointSettings, TMazeSettings
 from prefrl.store import Store
 from prefrl.types import Segment
 
@@ -64,3 +64,40 @@ def test_the_loop_learns_the_toy_from_another_seed_too(tmp_path: Path) -> None:
     with Store[Any](tmp_path) as store:
         first, *_, last = Config.load("control/toy", ["seed=1"]).build(store).run()
     check_learned(first.metrics, last.metrics)
+
+
+ON, LEFT, RIGHT = np.eye(3, dtype=np.float32)
+
+
+def test_a_maze_shows_its_sign_once_and_pays_for_the_arm_that_it_named(rng: np.random.Generator) -> None:
+    envs = TMazeSettings(length=4).build().environments(200)
+    first = envs.reset(rng)
+    signs = first[:, 0]
+    assert set(signs.tolist()) == {-1.0, 1.0}
+    seen = [envs.step(np.tile(ON, (200, 1))) for _ in range(3)]
+    assert not any(step.observations[:, 0].any() or step.rewards.any() for step in seen)
+    assert [bool(step.observations[:, 1].all()) for step in seen] == [False, False, True]
+    turns = np.where(rng.random((200, 1)) < 0.5, LEFT, RIGHT)
+    last = envs.step(turns)
+    np.testing.assert_array_equal(last.rewards, (turns[:, 2] - turns[:, 1] == signs).astype(float))
+    assert last.truncated.all()
+    assert set(last.observations[:, 0].tolist()) == {-1.0, 1.0}  # the next episode's
+
+
+def test_a_step_that_does_not_lead_on_costs_its_share_and_the_junction_is_missed(rng: np.random.Generator) -> None:
+    envs = TMazeSettings(length=4).build().environments(1)
+    envs.reset(rng)
+    rewards = [float(envs.step(action[None]).rewards[0]) for action in (LEFT, ON, ON, ON)]
+    assert rewards == [-0.25, 0.0, 0.0, 0.0]
+
+
+def test_a_picture_of_a_maze_shows_the_walker_and_the_right_arm() -> None:
+    task = TMazeSettings(length=5, frame_size=60).build()
+    states = np.array([[0.0, 1.0, 0.0, 0.0], [4.0, -1.0, -1.0, 5.0]])
+    frames = task.frames(Segment(np.zeros((2, 2), np.float32), np.zeros((2, 3), np.float32), "e", 0, states))
+    assert frames.shape == (2, 60, 60, 3)
+    assert frames[0, 32, 3].tolist() == list(INK)
+    assert frames[0, 52, 43].tolist() == list(MARK)
+    assert frames[1, 12, 43].tolist() == list(INK)  # in the right arm, over it
+    with pytest.raises(ConfigError, match="6 steps is longer than an episode of 5"):
+        TMazeSettings(length=5, segment_steps=6).build()

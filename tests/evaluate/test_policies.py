@@ -20,7 +20,7 @@ def _task(**settings: object) -> GymnasiumTask:
 def test_evaluation_means_over_first_episodes_only() -> None:
     task = _task(env="CartPole-v1", horizon=60, variable_horizon=True)
     right = np.array([0.0, 1.0], np.float32)
-    act = lambda o, legal: (np.tile(right, (len(o), 1)),) * 2  # noqa: E731
+    act = lambda o, legal, begins: (np.tile(right, (len(o), 1)),) * 2  # noqa: E731
     rollout = whole_episodes(task, act, 5, np.random.default_rng(0))
     model = MLPSettings(hidden=(4,)).build(task, np.random.default_rng(0))
     metrics = evaluation(task, rollout, model).metrics
@@ -31,7 +31,7 @@ def test_evaluation_means_over_first_episodes_only() -> None:
 
 def test_an_evaluation_counts_the_last_step_of_an_episode() -> None:
     task = _task()
-    act = lambda o, _: (o[:, :1],) * 2  # noqa: E731
+    act = lambda o, legal, begins: (o[:, :1],) * 2  # noqa: E731
     rollout = whole_episodes(task, act, 3, np.random.default_rng(0))
     metrics = evaluation(task, rollout, MLPSettings(hidden=(4,)).build(task, np.random.default_rng(0))).metrics
     assert metrics["length"] == 7.0

@@ -14,6 +14,7 @@ from prefrl import Config, stages
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.loop import Loop
+from prefrl.policies.mlp import MLPPolicy
 from prefrl.protocols import RewardModel
 from prefrl.rundir import Run, RunError
 from prefrl.stages import evaluate, shrink
@@ -21,7 +22,12 @@ from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
 from prefrl.types import Evaluation, Segment
 
-SMALL: dict[str, Any] = {"environments": 4, "steps_per_round": 1600, "hidden": (16,), "evaluation_episodes": 5}
+SMALL: dict[str, Any] = {
+    "environments": 4,
+    "steps_per_round": 1600,
+    "policy": {"hidden": (16,)},
+    "evaluation_episodes": 5,
+}
 NEAR = Known(lambda o, a: 1.0 - np.abs(o[..., 0]))
 """What the task is about: a step is worth more the nearer to the origin."""
 FAR = Known(lambda o, a: np.abs(o[..., 0]))
@@ -43,13 +49,14 @@ def turn(learner: ControlLearner, reward: RewardModel[Segment], rounds: int = 1)
 
 def ruin(learner: ControlLearner) -> None:
     """Push as hard as can be, whatever is seen."""
+    assert isinstance(learner.policy, MLPPolicy)
     with torch.no_grad():
         learner.policy.named()["actor_3"].fill_(5.0)
         learner.policy.named()["actor_2"].fill_(0.0)
 
 
 def weights(learner: ControlLearner) -> bytes:
-    return learner.policy.parameters()[0].detach().numpy().tobytes()
+    return b"".join(p.detach().numpy().tobytes() for p in learner.policy.parameters())
 
 
 def best_of(learner: ControlLearner) -> bytes:
@@ -82,7 +89,7 @@ def test_nothing_is_undone_by_chance_by_little_or_against_the_newest_reward() ->
     learner = built()
     turn(learner, NEAR, rounds=4)
     with torch.no_grad():
-        learner.policy.parameters()[0].add_(1e-3)
+        next(iter(learner.policy.parameters())).add_(1e-3)
     assert turn(learner, NEAR, rounds=0) is None
     ruin(learner)
     assert turn(learner, FAR, rounds=0) is None  # what was good by the old reward is worth little by the new one

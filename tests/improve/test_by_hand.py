@@ -14,7 +14,8 @@ from torch import Tensor
 from prefrl.improve import by_hand
 from prefrl.improve.gradient import Batch, adam, adam_of, step, update
 from prefrl.improve.objectives import Objective
-from prefrl.policies.mlp import Decisions, MLPPolicy
+from prefrl.policies.acting import Decisions
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.types import Metrics
 
 B = 40
@@ -32,7 +33,7 @@ HEADS = {"box": point(), "discrete": point(discrete=True), "legal": corridor()}
 
 def policy_of(head: str, dtype: torch.dtype) -> MLPPolicy:
     """Some way from its start, so that no gradient is small by accident."""
-    policy = MLPPolicy(HEADS[head], (9, 7), 0.6, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(9, 7), initial_std=0.6).build(HEADS[head], np.random.default_rng(0))
     (weights,) = policy.parameters()
     weights.data = weights.data.to(dtype)
     weights.data += 0.3 * torch.randn(weights.shape, generator=torch.Generator().manual_seed(1), dtype=dtype)

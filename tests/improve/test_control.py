@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.policies.mlp import MLPPolicy
 from prefrl.policies.rollout import Rollout
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.storage.checkpoints import load_state, save_state
@@ -29,7 +30,7 @@ SMALL: dict[str, Any] = {
     "epochs": 3,
     "critic_epochs": 2,
     "minibatch": 64,
-    "hidden": (8,),
+    "policy": {"hidden": (8,)},
     "evaluation_episodes": 3,
 }
 
@@ -46,7 +47,9 @@ def _bytes(learner: ControlLearner) -> bytes:
 
 @pytest.mark.parametrize("discrete", [False, True])
 def test_it_learns_to_stay_at_the_origin(store: Store[Segment], discrete: bool) -> None:
-    learner = _learner(point(discrete), seed=2, steps_per_round=1600, epochs=6, discount=0.9, hidden=(16, 16))
+    learner = _learner(
+        point(discrete), seed=2, steps_per_round=1600, epochs=6, discount=0.9, policy={"hidden": (16, 16)}
+    )
     before = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
     for number in range(4):
         learner.improve(Known(), store, np.random.default_rng(number))
@@ -155,8 +158,10 @@ def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_do
     )
     with torch.no_grad():
         policy = learner.policy
-        values = policy.values_of(torch.from_numpy(policy.normalise(rollout.observations)))
-        found = learner._next_values(rollout, values)
+        assert isinstance(policy, MLPPolicy)
+        unseen = np.array([[False, True, True, True]])
+        reading = policy.read(rollout, None, unseen)
+        found = learner._next_values(rollout, reading.values, reading.final, unseen)
 
         def value(x: float) -> float:
             inputs = torch.from_numpy(policy.normalise(np.array([[x]], np.float32)))

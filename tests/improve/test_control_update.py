@@ -12,6 +12,7 @@ from control_stubs import Known, point
 from torch import Tensor
 
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.policies.mlp import MLPPolicySettings
 from prefrl.store import Store
 from prefrl.types import Segment, State
 
@@ -25,14 +26,13 @@ def _learner(**settings: Any) -> ControlLearner:
         steps_per_round=60,
         rollout_steps=30,
         **{"epochs": 1, "critic_epochs": 0, "minibatch": 60, "target_kl": None} | settings,
-        hidden=(4,),
         discount=DISCOUNT,
         trace=TRACE,
         learning_rate=RATE,
         entropy=ENTROPY,
         value_weight=VALUE,
         max_grad_norm=1e9,
-        initial_std=0.5,
+        policy=MLPPolicySettings(hidden=(4,), initial_std=0.5),
         evaluation_episodes=3,
     ).build(point(), np.random.default_rng(0))
 
@@ -133,7 +133,9 @@ def test_a_round_steers_the_learning_rate_by_how_far_the_policy_went(
 @pytest.mark.parametrize("discrete", [False, True])
 def test_an_evaluation_plays_the_mode(discrete: bool) -> None:
     task = point(discrete)
-    learner = ControlLearnerSettings(hidden=(4,), evaluation_episodes=3).build(task, np.random.default_rng(0))
+    learner = ControlLearnerSettings(policy=MLPPolicySettings(hidden=(4,)), evaluation_episodes=3).build(
+        task, np.random.default_rng(0)
+    )
     found = learner.evaluate(Known(), np.random.default_rng(1)).examples
     policy = learner.policy.state()
     for segment in found:

@@ -15,8 +15,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from prefrl import Config, Run, load_policy
 from prefrl.envs.control import ControlSettings
 from prefrl.improve.control import ControlLearnerSettings
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.rundir import RunError
 from prefrl.stages import export_sb3, shrink
+
+PLAIN = MLPPolicySettings(hidden=(16, 8))
+OTHER = MLPPolicySettings(hidden=(16, 8), critic_hidden=(12,), activation="relu")
+POLICIES = {"Pendulum-v1": PLAIN, "CartPole-v1": PLAIN, "Hopper-v5": OTHER}
 
 
 def run(folder: Path, name: str, *settings: str) -> Path:
@@ -28,14 +33,15 @@ def run(folder: Path, name: str, *settings: str) -> Path:
 @pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1", "Hopper-v5"])
 def test_the_zip_acts_as_the_policy_does(env: str, tmp_path: Path) -> None:
     task, rng = ControlSettings(env=env, horizon=200).build(), np.random.default_rng(0)
-    learner = ControlLearnerSettings(hidden=(16, 8), device="cpu").build(task, rng)
+    learner = ControlLearnerSettings(policy=POLICIES[env], device="cpu").build(task, rng)
+    assert isinstance(learner.policy, MLPPolicy)
     learner.policy.observe(rng.normal(0.3, 2.0, (500, task.observation_size)))
     for _, parameter in learner.policy.named().items():
         parameter.data += 0.2 * torch.from_numpy(rng.standard_normal(parameter.shape)).float()
     learner.save(tmp_path / "policy.zip")
     loaded = PPO.load(tmp_path / "policy.zip", env=gymnasium.make(env), device="cpu")
     observations = rng.normal(0.3, 2.0, (300, task.observation_size)).astype(np.float32)
-    ours, theirs = learner.actor()(observations, None), loaded.predict(observations, deterministic=True)[0]
+    ours, theirs = learner.actor()(observations, None, None)[0], loaded.predict(observations, deterministic=True)[0]
     if env == "CartPole-v1":
         np.testing.assert_array_equal(ours.argmax(1), theirs)
     else:

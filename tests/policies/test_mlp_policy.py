@@ -8,12 +8,15 @@ import torch
 from corridor import corridor
 
 from prefrl.envs.control import ControlSettings
-from prefrl.policies.mlp import ActionSpace, Decisions, MLPPolicy
+from prefrl.policies.acting import Decisions
+from prefrl.policies.heads import ActionSpace
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 
 
 def _policy(env: str, seed: int = 0) -> MLPPolicy:
-    policy = MLPPolicy(ControlSettings(env=env, segment_steps=5).build(), (16, 16), 0.7, np.random.default_rng(seed))
-    policy.observe(np.random.default_rng(2).normal(1, 3, (50, len(policy.mean))))
+    task = ControlSettings(env=env, segment_steps=5).build()
+    policy = MLPPolicySettings(hidden=(16, 16), initial_std=0.7).build(task, np.random.default_rng(seed))
+    policy.observe(np.random.default_rng(2).normal(1, 3, (50, len(policy.normaliser.mean))))
     return policy
 
 
@@ -28,7 +31,7 @@ def test_numpy_acts_as_torch_would(env: str) -> None:
     policy = _policy(env)
     (weights,) = policy.parameters()
     weights.data += 0.1 * torch.randn(weights.shape, generator=torch.Generator().manual_seed(0))
-    observations = np.random.default_rng(3).normal(size=(9, len(policy.mean))).astype(np.float32)
+    observations = np.random.default_rng(3).normal(size=(9, len(policy.normaliser.mean))).astype(np.float32)
     theirs = policy._outputs("actor", torch.from_numpy(policy.normalise(observations)))
     choices, actions = policy.numpy_actor()(observations, None)
     if env == "CartPole-v1":
@@ -66,35 +69,35 @@ def test_gaussian_noise_has_the_stated_deviation_and_actions_keep_to_their_bound
 
 
 def test_the_normaliser_has_the_mean_and_variance_of_all_it_observed() -> None:
-    policy = MLPPolicy(ControlSettings(env="Pendulum-v1").build(), (4,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(4,)).build(ControlSettings(env="Pendulum-v1").build(), np.random.default_rng(0))
     data = np.random.default_rng(0).normal(5, 2, (90, 3)).astype(np.float32)
     policy.observe(data[:20].reshape(4, 5, 3))
     policy.observe(data[20:])
-    np.testing.assert_allclose(policy.mean, data.mean(0), rtol=1e-6)
-    np.testing.assert_allclose(policy.variance, data.var(0), rtol=1e-5)
+    np.testing.assert_allclose(policy.normaliser.mean, data.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(policy.normaliser.variance, data.var(0), rtol=1e-5)
     assert policy.normalise(np.full((1, 3), 1e6, np.float32)).tolist() == [[10.0] * 3]
 
 
 @pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
 def test_new_statistics_do_not_change_what_the_policy_does(env: str) -> None:
     policy, rng = _policy(env), np.random.default_rng(5)
-    size = len(policy.mean)
+    size = len(policy.normaliser.mean)
     observations = rng.normal(1, 2, (50, size)).astype(np.float32)
 
     def done() -> tuple[np.ndarray, np.ndarray]:
         inputs = torch.from_numpy(policy.normalise(observations))
         return policy._outputs("actor", inputs).detach().numpy(), policy.values_of(inputs).detach().numpy()
 
-    before, mean, variance = done(), policy.mean, policy.variance
+    before, mean, variance = done(), policy.normaliser.mean, policy.normaliser.variance
     policy.observe(rng.normal(3, 2, (40, size)))
-    assert np.abs(policy.mean - mean).min() > 0.5
-    assert np.abs(policy.variance - variance).min() > 0.1
+    assert np.abs(policy.normaliser.mean - mean).min() > 0.5
+    assert np.abs(policy.normaliser.variance - variance).min() > 0.1
     for one, other in zip(before, done(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
 def test_an_input_that_begins_to_change_does_not_blow_weights_up() -> None:
-    policy = MLPPolicy(ControlSettings(env="Pendulum-v1").build(), (4,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(4,)).build(ControlSettings(env="Pendulum-v1").build(), np.random.default_rng(0))
     still = np.random.default_rng(1).normal(0, 1, (50, 3)) * [1.0, 1.0, 0.0]
     policy.observe(still)
     policy.observe(still + np.random.default_rng(2).normal(0, 1, (50, 3)) * [0.0, 0.0, 1.0])
@@ -122,7 +125,7 @@ LEGAL = np.array([[True, False, True], [True, True, True], [False, True, False]]
 
 
 def test_actions_that_are_not_legal_are_never_chosen() -> None:
-    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(8,)).build(corridor(), np.random.default_rng(0))
     _lean(policy, [0.0, 3.0, 0.5])
     observations, legal = np.zeros((3_000, 1), np.float32), np.tile(LEGAL, (1_000, 1))
     drawn, _ = policy.numpy_actor()(observations, np.random.default_rng(1), legal)
@@ -135,7 +138,7 @@ def test_actions_that_are_not_legal_are_never_chosen() -> None:
 
 
 def test_the_densities_of_legal_actions_are_those_of_a_choice_among_them_alone() -> None:
-    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(8,)).build(corridor(), np.random.default_rng(0))
     _lean(policy, [0.0, 3.0, 0.5])
     choices = np.eye(3, dtype=np.float32)[[2, 0, 1]]
     logp, entropy = policy.log_prob(_three(choices))
@@ -152,7 +155,7 @@ def test_the_densities_of_legal_actions_are_those_of_a_choice_among_them_alone()
 
 
 def test_where_all_actions_are_legal_it_is_as_if_nobody_had_asked() -> None:
-    policy = MLPPolicy(corridor(), (8,), 1.0, np.random.default_rng(0))
+    policy = MLPPolicySettings(hidden=(8,)).build(corridor(), np.random.default_rng(0))
     choices, every = np.eye(3, dtype=np.float32), np.ones((3, 3), bool)
     free = Decisions(torch.zeros(3, 1), torch.from_numpy(choices))
     told = Decisions(free.observations, free.choices, torch.from_numpy(every))

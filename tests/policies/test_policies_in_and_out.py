@@ -19,6 +19,7 @@ from prefrl import load_policy
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.policies.mlp import MLPPolicySettings
 from prefrl.policies.zips import read_zip
 from prefrl.rundir import RunError, open_saved
 from prefrl.store import Store
@@ -38,7 +39,7 @@ def saved(path: Path, env: Any = "Pendulum-v1", **policy: Any) -> PPO:
 
 
 def started(path: Path, hidden: tuple[int, ...] = (16, 8), task: ControlSettings = TASK) -> ControlLearner:
-    settings = ControlLearnerSettings(start=path, hidden=hidden, device="cpu")
+    settings = ControlLearnerSettings(start=path, policy=MLPPolicySettings(hidden=hidden), device="cpu")
     return settings.build(task.build(), np.random.default_rng(5))
 
 
@@ -46,13 +47,13 @@ def test_a_learner_that_starts_from_a_zip_does_what_it_does(tmp_path: Path) -> N
     theirs = saved(tmp_path / "policy.zip")
     learner = started(tmp_path / "policy.zip")
     expected = theirs.predict(SEEN, deterministic=True)[0]
-    np.testing.assert_allclose(learner.actor()(SEEN, None), expected, atol=1e-5)
+    np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-5)
     values = learner.policy.values_of(torch.from_numpy(learner.policy.normalise(SEEN)))
     with torch.no_grad():
         np.testing.assert_allclose(values, theirs.policy.predict_values(torch.from_numpy(SEEN))[:, 0], atol=1e-5)
     np.testing.assert_allclose(load_policy(tmp_path / "policy.zip").predict(SEEN)[0], expected, atol=1e-5)
     learner.policy.observe(50 + 20 * SEEN)  # a rollout without gradient steps
-    np.testing.assert_allclose(learner.actor()(SEEN, None), expected, atol=1e-5)
+    np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-5)
 
 
 def test_the_statistics_beside_a_zip_are_taken_over_and_pickled_ones_are_refused(tmp_path: Path) -> None:
@@ -66,10 +67,10 @@ def test_the_statistics_beside_a_zip_are_taken_over_and_pickled_ones_are_refused
     np.savez(tmp_path / "policy.npz", mean=rms.mean, var=rms.var, count=rms.count)
     learner = started(tmp_path / "policy.zip")
     expected = theirs.predict(env.normalize_obs(SEEN), deterministic=True)[0]
-    np.testing.assert_allclose(learner.actor()(SEEN, None), expected, atol=1e-5)
+    np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-5)
     learner.policy.observe(np.random.default_rng(1).normal(0.0, 2.5, (400, 3)))
-    np.testing.assert_allclose(learner.actor()(SEEN, None), expected, atol=1e-4)
-    assert not np.allclose(learner.policy.mean, rms.mean)  # the normaliser moved
+    np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-4)
+    assert not np.allclose(learner.policy.normaliser.mean, rms.mean)  # the normaliser moved
 
 
 def test_a_learner_that_starts_from_a_run_does_what_it_does_and_goes_on_without_it(
@@ -81,11 +82,11 @@ def test_a_learner_that_starts_from_a_run_does_what_it_does_and_goes_on_without_
     task, observations = config.build_task(), np.array([[0.3, -0.2], [0.9, 0.1]], np.float32)
     learner = settings.build(task, np.random.default_rng(9))
     expected = load_policy(run).predict(observations)[0]
-    np.testing.assert_array_equal(learner.actor()(observations, None), expected)
+    np.testing.assert_array_equal(learner.actor()(observations, None, None)[0], expected)
     shutil.rmtree(run)
     again = settings.build(task, np.random.default_rng(3))
     again.load(learner.state())
-    np.testing.assert_array_equal(again.actor()(observations, None), expected)
+    np.testing.assert_array_equal(again.actor()(observations, None, None)[0], expected)
     with pytest.raises(ConfigError, match="there is no "):
         settings.build(task, np.random.default_rng(3)).actor()
 
@@ -97,7 +98,7 @@ def test_what_cannot_be_a_start_is_refused(finished_tiny: dict[str, Path], tmp_p
     (tmp_path / "no.zip").write_text("nothing")
     cartpole = ControlSettings(env="CartPole-v1")
     for path, task, hidden, message in (
-        (tmp_path / "policy.zip", TASK, (64, 64), r"set learner.hidden=\[16, 8\]"),
+        (tmp_path / "policy.zip", TASK, (64, 64), r"set learner.policy.hidden=\[16, 8\]"),
         (tmp_path / "policy.zip", cartpole, (16, 8), "expected a policy for CartPole-v1, with observations of 4"),
         (tmp_path / "relu.zip", TASK, (16, 8), "expected a policy with tanh, and this one has ReLU"),
         (tmp_path / "uneven.zip", TASK, (16, 8), "of the same widths"),
@@ -128,7 +129,7 @@ def test_onnx_acts_as_the_policy_does(env: str, tmp_path: Path) -> None:
 
     from prefrl.policies.to_onnx import save_onnx
 
-    learner = ControlLearnerSettings(hidden=(16, 8), device="cpu").build(
+    learner = ControlLearnerSettings(policy=MLPPolicySettings(hidden=(16, 8)), device="cpu").build(
         ControlSettings(env=env).build(), np.random.default_rng(0)
     )
     rng, size = np.random.default_rng(1), 3 if env == "Pendulum-v1" else 4

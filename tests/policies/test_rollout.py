@@ -20,7 +20,7 @@ def _task(**settings: object) -> GymnasiumTask:
     return ControlSettings.model_validate({"env": "Pendulum-v1", "horizon": 7, "segment_steps": 3, **settings}).build()
 
 
-def _act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+def _act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
     actions = observations[:, :1] * 0.5
     return actions, actions
 

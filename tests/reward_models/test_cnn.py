@@ -59,7 +59,7 @@ def _model(task: GymnasiumTask, **settings: Any) -> StepReward:
 def _rollout(task: GymnasiumTask, count: int = 8, steps: int = 60) -> Rollout:
     rng, envs = np.random.default_rng(0), task.environments(count)
 
-    def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+    def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
         actions = rng.uniform(-1, 1, (count, 1)).astype(np.float32)
         return actions, actions
 

@@ -20,7 +20,7 @@ def _task(**settings: object) -> GymnasiumTask:
     return ControlSettings.model_validate({"env": "Pendulum-v1", "horizon": 7, "segment_steps": 3, **settings}).build()
 
 
-def _act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+def _act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
     actions = observations[:, :1] * 0.5
     return actions, actions
 
@@ -29,7 +29,7 @@ def _alternating() -> Act:
     """Push left and right by turns: a pole stands for some 30 steps."""
     turn = iter(range(10_000))
 
-    def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+    def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
         actions = np.tile(np.eye(2, dtype=np.float32)[next(turn) % 2], (len(observations), 1))
         return actions, actions
 
@@ -110,7 +110,9 @@ def test_episodes_that_are_shorter_than_segments_are_an_error_and_not_endless() 
     with pytest.raises(
         ValueError, match=r"hold 0 segments of 150 steps.* 20 were.*longest episode seen had (9|10|11) "
     ):
-        first_rollout(task, lambda o, legal: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0))
+        first_rollout(
+            task, lambda o, legal, begins: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0)
+        )
 
 
 def test_windows_are_counted_across_parts_as_in_the_whole() -> None:
