@@ -24,7 +24,7 @@ from prefrl.fit.split import split
 from prefrl.improve.gradient import adam_of, descend_by_logp
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import Player
-from prefrl.kinds import SEGMENTS
+from prefrl.kinds import kind_of
 from prefrl.policies.acting import Decisions
 from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
@@ -258,7 +258,7 @@ def _data(path: Path | None, task: ControlTask) -> tuple[Segment, ...]:
     if path is None:
         return tuple(task.segments) if isinstance(task, Recorded) else ()
     found = recording(path).segments
-    if misfit := SEGMENTS.misfit(found[0], task):
+    if misfit := kind_of(found[0]).misfit(found[0], task):
         raise ValueError(f"learner.data: a segment of {path} {misfit}: choose another file or task")
     if all(len(one) < task.segment_steps for one in found):
         raise ValueError(f"learner.data: {path} has no segment of task.segment_steps={task.segment_steps} steps")
