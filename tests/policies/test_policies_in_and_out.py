@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ from prefrl import load_policy
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
-from prefrl.policies.mlp import MLPPolicySettings
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.zips import read_zip
 from prefrl.rundir import RunError, open_saved
 from prefrl.store import Store
@@ -48,7 +48,8 @@ def test_a_learner_that_starts_from_a_zip_does_what_it_does(tmp_path: Path) -> N
     learner = started(tmp_path / "policy.zip")
     expected = theirs.predict(SEEN, deterministic=True)[0]
     np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-5)
-    values = learner.policy.values_of(torch.from_numpy(learner.policy.normalise(SEEN)))
+    policy = cast(MLPPolicy, learner.policy)
+    values = policy.values_of(torch.from_numpy(policy.normalise(SEEN)))
     with torch.no_grad():
         np.testing.assert_allclose(values, theirs.policy.predict_values(torch.from_numpy(SEEN))[:, 0], atol=1e-5)
     np.testing.assert_allclose(load_policy(tmp_path / "policy.zip").predict(SEEN)[0], expected, atol=1e-5)
@@ -70,7 +71,7 @@ def test_the_statistics_beside_a_zip_are_taken_over_and_pickled_ones_are_refused
     np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-5)
     learner.policy.observe(np.random.default_rng(1).normal(0.0, 2.5, (400, 3)))
     np.testing.assert_allclose(learner.actor()(SEEN, None, None)[0], expected, atol=1e-4)
-    assert not np.allclose(learner.policy.normaliser.mean, rms.mean)  # the normaliser moved
+    assert not np.allclose(cast(MLPPolicy, learner.policy).normaliser.mean, rms.mean)  # the normaliser moved
 
 
 def test_a_learner_that_starts_from_a_run_does_what_it_does_and_goes_on_without_it(
@@ -78,7 +79,7 @@ def test_a_learner_that_starts_from_a_run_does_what_it_does_and_goes_on_without_
 ) -> None:
     run = shutil.copytree(finished_tiny["control/toy"], tmp_path / "run")
     config = open_saved(run).config
-    settings = config.learner.model_copy(update={"start": run})
+    settings = cast(ControlLearnerSettings, config.learner.model_copy(update={"start": run}))
     task, observations = config.build_task(), np.array([[0.3, -0.2], [0.9, 0.1]], np.float32)
     learner = settings.build(task, np.random.default_rng(9))
     expected = load_policy(run).predict(observations)[0]
@@ -137,7 +138,7 @@ def test_onnx_acts_as_the_policy_does(env: str, tmp_path: Path) -> None:
     for parameter in learner.policy.parameters():
         parameter.data += 0.5 * torch.from_numpy(rng.standard_normal(parameter.shape)).float()
     observations = (3 * rng.standard_normal((50, size))).astype(np.float32)
-    actor = learner.policy.numpy_actor()
+    actor = cast(MLPPolicy, learner.policy).numpy_actor()
     save_onnx(actor, tmp_path / "policy.onnx")
     found = ReferenceEvaluator(str(tmp_path / "policy.onnx")).run(None, {"observations": observations})[0]
     actions = actor(observations, None)[1]

@@ -77,7 +77,7 @@ def test_an_action_that_is_not_finite_is_told_before_the_environment_sees_it() -
     envs = Wrapped(Faulty, 2, 10, "absorb")
     steps = iter(range(5))
 
-    def act(observations: Floats, legal: Bools | None) -> tuple[Floats, Floats]:
+    def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
         actions = np.zeros((2, 1), np.float32)
         actions[1] = np.inf if next(steps) == 2 else 0.0
         return actions, actions
