@@ -53,10 +53,13 @@ def _of_run(folder: Path) -> _Found:
     checkpoint, _ = newest(folder)
     state = load_state(checkpoint, "learner")
     ours, theirs = state.get("policy", {}), state.get("modules", {}).get("policy", {})
+    said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
+    network = said["learner"].get("policy", {})
+    if ours and (network.get("kind", "mlp"), network.get("activation", "tanh")) != ("mlp", "tanh"):
+        raise ConfigError(f"learner.start: {folder} has another network, {network}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
         raise ConfigError(f"learner.start: {folder} holds no policy of control that can be taken over; expected {OURS}")
-    said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))["task"]
-    settings = settings_class("tasks", said["kind"]).model_validate(said)
+    settings = settings_class("tasks", said["task"]["kind"]).model_validate(said["task"])
     task = cast(ControlTask, cast(TaskSettings, settings).build())
     return _Found(ours if "mean" in ours else state_of(theirs, ActionSpace.of(task)), task.action_bounds)
 

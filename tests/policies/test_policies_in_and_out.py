@@ -79,7 +79,8 @@ def test_a_learner_that_starts_from_a_run_does_what_it_does_and_goes_on_without_
 ) -> None:
     run = shutil.copytree(finished_tiny["control/toy"], tmp_path / "run")
     config = open_saved(run).config
-    settings = cast(ControlLearnerSettings, config.learner.model_copy(update={"start": run}))
+    assert isinstance(config.learner, ControlLearnerSettings)
+    settings = config.learner.model_copy(update={"start": run})
     task, observations = config.build_task(), np.array([[0.3, -0.2], [0.9, 0.1]], np.float32)
     learner = settings.build(task, np.random.default_rng(9))
     expected = load_policy(run).predict(observations)[0]
