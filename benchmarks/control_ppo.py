@@ -61,8 +61,9 @@ class TrueReward:
 
 
 class Ours:
-    def __init__(self, env: str, seed: int, steer: bool) -> None:
+    def __init__(self, env: str, seed: int, steer: bool, fresh: bool = False) -> None:
         settings = ControlLearnerSettings(
+            fresh_starts=fresh,
             environments=ENVIRONMENTS,
             steps_per_round=BATCH,
             rollout_steps=STEPS,
@@ -128,6 +129,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=100, help="the first seed")
     parser.add_argument("--keep-rate", action="store_true", help="our learning rate is not steered by the KL")
+    parser.add_argument("--fresh", action="store_true", help="our rollouts begin with new episodes each")
     parser.add_argument("--out", type=Path, default=Path("runs/control-ppo"))
     parser.add_argument("--short", action="store_true", help="a window a side")
     options = parser.parse_args()
@@ -169,11 +171,14 @@ def returns(options: argparse.Namespace) -> dict[str, Any]:
     found: dict[str, list[float]] = {"ours": [], "peer": []}
     for seed in seeds:
         for name, values in found.items():
-            kept = options.out / f"{options.env}-{options.steps}-{name}{'-kept' * options.keep_rate}-{seed}.json"
+            variant = "-kept" * options.keep_rate + "-fresh" * options.fresh if name == "ours" else ""
+            kept = options.out / f"{options.env}-{options.steps}-{name}{variant}-{seed}.json"
             if not kept.exists():
-                side = Ours(options.env, seed, not options.keep_rate) if name == "ours" else Peer(options.env, seed)
-                for _ in range(-(-options.steps // BATCH)):
-                    side.learn(1)
+                ours = name == "ours"
+                side = (
+                    Ours(options.env, seed, not options.keep_rate, options.fresh) if ours else Peer(options.env, seed)
+                )
+                side.learn(-(-options.steps // BATCH))  # at once: a call begins with new episodes
                 kept.write_text(json.dumps(side.gold()))
             values.append(json.loads(kept.read_text()))
             print(f"{name} {seed}: {values[-1]:.0f}", flush=True)

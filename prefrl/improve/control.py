@@ -76,6 +76,9 @@ class ControlLearnerSettings(Settings):
     """Environment steps of one round's learning, all environments together; a multiple of `environments`."""
     rollout_steps: int = Field(128, ge=2)
     """Steps in each environment between updates, about: a round is divided into equal rollouts."""
+    fresh_starts: bool = False
+    """Begin each rollout with new episodes, as if time were up (partial-episode bootstrapping, Pardo et al. 2018): no
+    more of an episode is learned from than `rollout_steps`, and less of what follows once a body has fallen."""
     epochs: int = Field(10, ge=1)
     """Passes over each rollout."""
     minibatch: int = Field(256, ge=2)
@@ -215,8 +218,12 @@ class ControlLearner:
         observations, memory, begins = envs.reset(rng), None, None
         lengths = self._rollout_lengths()
         for number, steps in enumerate(lengths):
+            if number and self._settings.fresh_starts:
+                observations, memory, begins = envs.reset(rng), None, None
             act = Acting(self._decide(), rng, memory)
             rollout, observations = collect(envs, observations, steps, act, begins)
+            if self._settings.fresh_starts:
+                rollout.truncated[:, -1] |= ~rollout.terminated[:, -1]
             read = partial(self.policy.read, rollout, memory)
             # Only before the first rollout is the reward one that the critic has not seen.
             metrics.append(self._learn(rollout, read, scorer, rng, self._left(number / len(lengths)), number == 0))
