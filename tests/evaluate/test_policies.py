@@ -26,7 +26,7 @@ def test_evaluation_means_over_first_episodes_only() -> None:
     metrics = evaluation(task, rollout, model).metrics
     assert 8 <= metrics["length"] <= 11
     assert metrics["gold"] == metrics["length"]
-    assert set(metrics) == {"gold", "gold_std", "learned", "length"}
+    assert set(metrics) == {"count", "gold", "gold_std", "learned", "length"}
 
 
 def test_an_evaluation_counts_the_last_step_of_an_episode() -> None:

@@ -126,7 +126,7 @@ def test_a_policy_has_nothing_to_learn_from_answers_by_the_reward_that_it_implie
     store = preferred.answers(there.sample(200, np.random.default_rng(0)), reward, ANSWERS[loss])
     found = there.improve(NO_REWARD, store, np.random.default_rng(0))
     assert found["margin"] > 0.02
-    assert found["grad_norm"] < 1e-4
+    assert found["grad_norm"] < 3e-4  # of float32's rounding, which is another on each machine; away from there 0.01
     assert away.improve(NO_REWARD, store, np.random.default_rng(0))["grad_norm"] > 0.01
 
 

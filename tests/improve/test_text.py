@@ -226,6 +226,7 @@ def test_an_evaluation_repeats_itself_and_starts_without_kl(toy_reviews: Reviews
     assert abs(first.metrics["kl"]) < 1e-3
     assert set(first.metrics) == {
         "gold",
+        "count",
         "gold_std",
         "learned",
         "kl",
