@@ -70,16 +70,16 @@ def test_reinforce_is_a_choice_of_settings_and_learns_too(store: Store[Segment])
 
 
 def test_fresh_starts_begin_each_rollout_with_new_episodes_that_no_segment_spans(store: Store[Segment]) -> None:
-    def beginnings(**settings: object) -> set[str]:
-        learner = _learner(point(), steps_per_round=160, rollout_steps=10, **settings)  # four rollouts in each
+    def beginnings(fresh: bool) -> set[str]:
+        learner = _learner(point(), steps_per_round=160, rollout_steps=10, fresh_starts=fresh)  # four rollouts in each
         learner.improve(Known(), store, np.random.default_rng(1))
         segments = learner.sample(60, np.random.default_rng(2))
         # A jump to a new start is none that a push can make.
         assert max(np.abs(np.diff(one.observations[:, 0])).max() for one in segments) < 1.0
         return {one.episode.rsplit("/", 1)[1] for one in segments}
 
-    assert beginnings() == {"0", "20"}  # the horizon
-    assert beginnings(fresh_starts=True) == {"0", "10", "20", "30"}
+    assert beginnings(False) == {"0", "20"}  # the horizon
+    assert beginnings(True) == {"0", "10", "20", "30"}
 
 
 def test_every_step_of_the_environments_is_counted_once_by_purpose(store: Store[Segment]) -> None:
