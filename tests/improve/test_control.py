@@ -71,8 +71,12 @@ def test_reinforce_is_a_choice_of_settings_and_learns_too(store: Store[Segment])
 
 def test_fresh_starts_begin_each_rollout_with_new_episodes_that_no_segment_spans(store: Store[Segment]) -> None:
     def beginnings(fresh: bool) -> set[str]:
+        """Where episodes begin; a rollout's last step leads on to the next one's first, or does not."""
         learner = _learner(point(), steps_per_round=160, rollout_steps=10, fresh_starts=fresh)  # four rollouts in each
         learner.improve(Known(), store, np.random.default_rng(1))
+        rollout = learner._player._recent
+        assert rollout is not None
+        assert (rollout.observations[:, 10] == rollout.final_observations[:, 9]).any() != fresh
         segments = learner.sample(60, np.random.default_rng(2))
         # A jump to a new start is none that a push can make.
         assert max(np.abs(np.diff(one.observations[:, 0])).max() for one in segments) < 1.0
