@@ -26,6 +26,11 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
+    @classmethod
+    def renamed(cls, saved: dict[str, Any]) -> dict[str, Any]:
+        """Settings that an earlier version saved, in today's names."""
+        return saved
+
     def shrunk(self) -> Self:
         """The same with as little work as still makes sense: for dry runs and tests."""
         return self
@@ -162,6 +167,13 @@ def settings_class(role: Role, kind: str) -> type[Settings]:
             f"{role[:-1]} kind {kind!r} must name a subclass of prefrl.components.Settings, got {found!r}"
         )
     return found
+
+
+def todays(role: Role, saved: dict[str, Any]) -> dict[str, Any]:
+    """A component's settings in today's names, as far as its kind is known; `saved` may be of an earlier version."""
+    kind = saved.get("kind")
+    kind = RENAMED.get(role, {}).get(kind, kind) if isinstance(kind, str) else None
+    return settings_class(role, kind).renamed(saved | {"kind": kind}) if kind in kinds(role) else saved
 
 
 def missing(error: ModuleNotFoundError) -> str:

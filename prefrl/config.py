@@ -14,7 +14,7 @@ import yaml
 from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
-from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest
+from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest, todays
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
@@ -35,6 +35,15 @@ from prefrl.types import Json
 
 if TYPE_CHECKING:
     from prefrl.store import Store
+
+ROLES: dict[str, Role] = {
+    "task": "tasks",
+    "labeler": "labelers",
+    "select": "selectors",
+    "reward": "rewards",
+    "learner": "learners",
+}
+"""Part of the settings -> whose kinds it chooses from."""
 
 
 def _component(role: Role, default: str | None, value: object) -> Settings:
@@ -90,7 +99,19 @@ class Config(Settings):
 
         Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
         """
-        data = _read(source)
+        return cls._changed(_read(source), overrides)
+
+    @classmethod
+    def reopen(cls, path: Path, overrides: Sequence[str] = ()) -> Config:
+        """Read what a run or a reward model was saved with, by this version or an earlier one, with overrides."""
+        data = _read(path)
+        for part, role in ROLES.items():
+            if isinstance(data.get(part), dict):
+                data[part] = todays(role, data[part])
+        return cls._changed(data, overrides)
+
+    @classmethod
+    def _changed(cls, data: Json, overrides: Sequence[str]) -> Config:
         for override in sorted(overrides, key=lambda o: not o.partition("=")[0].endswith("kind")):
             _apply(data, override)  # kinds first: a new kind drops what was set for the old one
         return cls.parse(data)

@@ -130,7 +130,7 @@ class Duel:
     def _by_labeler(self, task: TextTask) -> Decide:
         if others := [one for one in self.labeler if not one.startswith("labeler.")]:
             raise ConfigError(f"{others[0]}: expected settings of the labeler alone, as labeler.key=value")
-        config = Config.load(open_saved(self.folder).folder / "config.yaml", self.labeler)
+        config = Config.reopen(open_saved(self.folder).folder / "config.yaml", self.labeler)
         if config.labeler.asks_people():
             raise RunError(
                 "a win rate is judged at once, by a labeler that answers by itself, such as labeler.kind=judge; "

@@ -246,7 +246,7 @@ def saved_config(folder: Path) -> Config:
     """The settings in a folder. Raises `RunError` where there are none."""
     if not (folder / "config.yaml").is_file():
         raise RunError(f"{folder} holds no run: expected a file config.yaml in it")
-    return Config.load(folder / "config.yaml")
+    return Config.reopen(folder / "config.yaml")
 
 
 def _refuse_strangers(folder: Path) -> None:
@@ -268,7 +268,7 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
     """
     path = folder / "config.yaml"
     begun = bool(checkpoints(folder)) or store.sequence > 0
-    found = Config.load(path) if path.exists() and begun else config
+    found = Config.reopen(path) if path.exists() and begun else config
     if _lasting(found) != _lasting(config):
         difference = _difference(_lasting(found), _lasting(config))
         raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")

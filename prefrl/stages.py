@@ -93,7 +93,7 @@ def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: No
     if not (folder / "store.db").exists() and not (folder / "store.url").exists():
         raise RunError(f"{folder} holds no store: expected the folder of a run, or of `prefrl label`")
     saved_config(folder)  # says what is missing, if it is
-    config = Config.load(folder / "config.yaml", ["labeler.kind=web", *overrides])
+    config = Config.reopen(folder / "config.yaml", ["labeler.kind=web", *overrides])
     with Store(folder) as store:
         labeler = config.build_labeler(config.build_task())
         with attended(labeler, store, tell):

@@ -126,6 +126,12 @@ class ControlLearnerSettings(Settings):
             raise ValueError("\n".join(f".{name}: this is now learner.policy.{name}; write it there" for name in moved))
         return filled_in(given, ALGORITHMS)
 
+    @classmethod
+    def renamed(cls, saved: dict[str, Any]) -> dict[str, Any]:
+        kept = {name: value for name, value in saved.items() if name not in MOVED}
+        moved = {name: value for name, value in saved.items() if name in MOVED}
+        return kept | {"policy": {"kind": "mlp"} | moved} if moved else saved
+
     @model_validator(mode="after")
     def _whole_steps(self) -> ControlLearnerSettings:
         if self.steps_per_round % self.environments or self.steps_per_round < 2 * self.environments:

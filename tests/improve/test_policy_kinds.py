@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from control_stubs import Known, point
 
 from prefrl import Config, Run, load_policy
@@ -83,6 +84,20 @@ def test_what_moved_into_the_policy_is_said_and_kinds_are_told_apart() -> None:
     config = Config.load("control/toy", ["learner.policy.kind=gru", "learner.policy.width=8"])
     assert config.learner.model_dump()["policy"]["width"] == 8
     assert Config.parse(config.model_dump(mode="json")) == config
+
+
+def test_a_folder_with_settings_of_an_earlier_version_is_opened(tmp_path: Path) -> None:
+    config = shrink(Config.load("control/toy", ["learner.policy.hidden=[8]", "learner.policy.initial_std=0.5"]))
+    with Run(config, tmp_path / "run") as run:
+        before = [round.metrics for round in run]
+    path = tmp_path / "run" / "config.yaml"
+    saved = yaml.safe_load(path.read_text())
+    moved = saved["learner"].pop("policy")
+    saved["learner"] |= {"kind": "ppo", "hidden": moved["hidden"], "initial_std": moved["initial_std"]}
+    path.write_text(yaml.safe_dump(saved))
+    with Run.resume(tmp_path / "run") as run:
+        assert run.config == config
+        assert run.loop.round == len(before) - 1
 
 
 def test_a_run_of_a_recurrent_policy_is_loaded_but_not_exported(tmp_path: Path) -> None:
