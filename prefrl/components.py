@@ -126,6 +126,7 @@ EXTRAS = {
     "pyarrow": "interchange",
     "minari": "interchange",
     "onnx": "onnx",
+    "submitit": "slurm",
 }
 
 

@@ -249,6 +249,14 @@ def saved_config(folder: Path) -> Config:
     return Config.reopen(folder / "config.yaml")
 
 
+def finished(folder: Path) -> bool:
+    """Whether a folder holds a run with all its rounds, and its report."""
+    summary = folder / "summary.json"
+    if not summary.is_file() or not (folder / "report.html").is_file():
+        return False
+    return bool(json.loads(summary.read_text())["rounds"] >= saved_config(folder).loop.rounds)
+
+
 def _refuse_strangers(folder: Path) -> None:
     """Raise `RunError` where a folder holds things but no settings, so that it is not ours."""
     if folder.exists() and not folder.is_dir():

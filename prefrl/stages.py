@@ -146,14 +146,14 @@ def with_gold(responses: list[Response], task: Any) -> list[Response]:
 
 
 def config_of(source: Path, config: str | None) -> str:
-    """The preset or file with the settings for a source of judgements: the one given, or the folder's own."""
+    """What has the settings for a source of judgements: the preset or file that is given, or the folder itself."""
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder")
     if config is None and source.is_file():
         raise ConfigError(f"{source} is a file of judgements: say which settings to use, --config text/replies say")
     if config is None and not (source / "config.yaml").is_file():
         raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
-    return config or str(source / "config.yaml")
+    return config or str(source)
 
 
 def fit_reward(config: Config, source: Path, out: Path, which: Which | None = None) -> tuple[Fitted, tuple[str, ...]]:

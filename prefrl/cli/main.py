@@ -16,6 +16,8 @@ import typer
 from prefrl.cli.exchange import Labelers, Out, Split
 from prefrl.cli.exchange import commands as exchange_commands
 from prefrl.cli.film import commands as film_commands
+from prefrl.cli.many import Jobs, drive_all, over_seeds
+from prefrl.cli.many import commands as many_commands
 from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
 
@@ -34,6 +36,7 @@ app = typer.Typer(
 )
 app.add_typer(exchange_commands)
 app.add_typer(film_commands)
+app.add_typer(many_commands)
 app.add_typer(store_commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
@@ -63,12 +66,19 @@ def run(
         bool, typer.Option(help="Build everything, run a small round, estimate time, write nothing.")
     ] = False,
     ranks: Ranks = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs with as many seeds, from `seed` on, and compares them.")] = 1,
+    jobs: Jobs = 1,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
     from prefrl.cli.console import drive, say
     from prefrl.rundir import Run
 
     config = _load(source, overrides)
+    _refuse(seeds > 1 and ranks > 1, "--seeds and --ranks are two ways to use several processes: choose one")
+    _refuse(jobs > 1 and seeds == 1, "--jobs goes with --seeds: how many of its runs go on at once")
+    if seeds > 1 and not dry_run:
+        drive_all(over_seeds(source, overrides or [], seeds), out or _new_folder(source), jobs, "local")
+        return
     if dry_run:
         _dry_run(config)
         return
@@ -132,7 +142,7 @@ def label(
         extra = ["labeler.kind=web", *[f"labeler.host={host}"] * bool(host)]
         extra += [f"labeler.port={port}"] * (port is not None)
     policy = open_saved(source) if Path(source).is_dir() and not there else None
-    path = str(policy.folder / "config.yaml") if policy else source
+    path = str(policy.folder) if policy else source
     settings = [*extra, *(overrides or [])]
     try:
         if there:
@@ -378,7 +388,7 @@ def _load(source: str, overrides: list[str] | None) -> Config:
     from prefrl.config import Config
 
     if Path(source).is_dir():
-        source = str(Path(source) / "config.yaml")
+        return Config.reopen(Path(source) / "config.yaml", overrides or [])
     return Config.load(source, overrides or [])
 
 

@@ -104,6 +104,51 @@ def lines(
     return _svg(name, draw) if drawn else Markup("")
 
 
+@dataclass(frozen=True)
+class Strip:
+    """What the runs of a group came to."""
+
+    label: str
+    values: Sequence[float]
+    mean: float
+    low: float | None
+    high: float | None
+
+
+def several(name: str, curves: Sequence[tuple[Sequence[float], Line]], label: str) -> Markup:
+    """Curves that each have an x of their own; empty where none has a point."""
+    drawn = [(x, curve) for x, curve in curves if x]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        for x, curve in drawn:
+            _curve(axes, np.array(x), curve)
+        axes.set_xlabel(label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7, min_n_ticks=1))
+        _legend(axes, sum(bool(curve.label) for _, curve in drawn))
+
+    return _svg(name, draw) if drawn else Markup("")
+
+
+def strips(name: str, found: Sequence[Strip], colours: Sequence[str], label: str) -> Markup:
+    """A row for each group: its runs as dots, their mean with its interval; empty without groups."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        for at, (strip, colour) in enumerate(zip(found, colours, strict=True)):
+            shade = COLOURS[colour]
+            axes.scatter(strip.values, [at] * len(strip.values), s=22, color=shade, alpha=0.45, linewidths=0)
+            if strip.low is not None and strip.high is not None:
+                axes.hlines(at + 0.22, strip.low, strip.high, color=shade, linewidth=2.2)
+            axes.plot(strip.mean, at + 0.22, "D", color=shade, markersize=6)
+        axes.set_yticks(range(len(found)), [strip.label for strip in found])
+        axes.set_ylim(len(found) - 0.4, -0.6)
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel(label)
+
+    return _svg(name, draw) if found else Markup("")
+
+
 def path(name: str, x: Series, y: Series, labels: tuple[str, str]) -> Markup:
     """One metric against another, round by round, from a hollow dot to a full one; empty with under two points."""
     points = np.array([(a, b) for a, b in zip(x, y, strict=True) if a is not None and b is not None])

@@ -81,8 +81,9 @@ class Record:
         return next((value for value in reversed(self.series(key)) if value is not None), None)
 
 
-def read(folder: Path) -> Record:
-    """Read a run's folder. Raises `NotADirectoryError` when there is none; every file in it may be missing."""
+def read(folder: Path, examples: bool = True) -> Record:
+    """Read a run's folder, with or without its examples. Raises `NotADirectoryError` when there is none; every file in
+    it may be missing."""
     if not folder.is_dir():
         raise NotADirectoryError(f"expected the folder of a run, got {str(folder)!r}, which is not a folder")
     missing: list[str] = []
@@ -97,8 +98,8 @@ def read(folder: Path) -> Record:
         planned=_planned(config),
         reliability=_reliability(held_out, missing),
         fitted_round=whole(held_out.get("round")),
-        before=_examples(folder / "examples" / "before.json", missing),
-        after=_examples(folder / "examples" / "after.json", missing),
+        before=_examples(folder / "examples" / "before.json", missing) if examples else (),
+        after=_examples(folder / "examples" / "after.json", missing) if examples else (),
         card=_part(ReportCard, folder / "card.json", missing),
         hindsight=_part(Hindsight, folder / "hindsight.json", missing),
         missing=tuple(missing),

@@ -31,7 +31,7 @@ def write_report(folder: Path) -> Path:
 def render(record: Record) -> str:
     """The page of a run."""
     facts = gather(record)
-    return _page(
+    return page(
         "report.html",
         facts=facts,
         record=record,
@@ -47,11 +47,11 @@ def render(record: Record) -> str:
 
 def render_card(card: ReportCard) -> str:
     """A report card as a page of its own."""
-    return _page("card.html", model=visible(card.about.model, 200), grades=grades(card))
+    return page("card.html", model=visible(card.about.model, 200), grades=grades(card))
 
 
-def _page(name: str, **values: Any) -> str:
-    """A template filled in. All values are escaped; only this package's own figures and style are not."""
+def page(name: str, **values: Any) -> str:
+    """A template of this package filled in. All values are escaped but this package's own figures and style."""
     here = files("prefrl.report")
     environment = Environment(
         autoescape=True,

@@ -53,6 +53,18 @@ def own(folder: Path) -> FileLock:
     return lock
 
 
+def owned(folder: Path) -> bool:
+    """Whether some process is writing to a folder."""
+    path = folder / "owner.lock"
+    if not path.exists():
+        return False
+    try:
+        with FileLock(path, timeout=0):
+            return False
+    except Timeout:
+        return True
+
+
 def disown(folder: Path, lock: FileLock) -> None:
     """Give up what `own` gave."""
     (folder / "owner.json").unlink(missing_ok=True)  # before the release, or it could be the next owner's

@@ -1,0 +1,144 @@
+"""Where the runs of a sweep are started: in processes of this machine, or through submitit on a cluster.
+
+Each is the command `prefrl run` in a process of its own, with one thread unless `OMP_NUM_THREADS` says otherwise, so
+that a run comes to the same result wherever it was started.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from prefrl.components import ConfigError, suggest
+from prefrl.sweeps.plan import Member
+
+STOPPING = 30.0
+"""Seconds that runs are given to stop in good order."""
+HOURS = 72
+"""That a job of a cluster may take."""
+
+
+class Job(NamedTuple):
+    """A run that is to be started."""
+
+    member: Member
+    folder: Path
+    log: Path
+    """Takes what the command says."""
+
+    def command(self) -> list[str]:
+        python = [sys.executable, "-m", "prefrl", "run"]
+        return [*python, self.member.source, *self.member.overrides, "--out", str(self.folder)]
+
+
+class Launcher(Protocol):
+    """A place where commands run."""
+
+    def call(self, job: Job) -> int:
+        """Run it to its end, and give its exit status; called from several threads."""
+
+    def stop(self) -> None:
+        """Stop what is running, in good order; nothing is started any more."""
+
+
+def launcher(name: str, state: Path) -> Launcher:
+    """The launcher of a name; `state` is a folder for what it writes. Raises `ConfigError`."""
+    made: dict[str, Callable[[], Launcher]] = {"local": Local, "submitit": lambda: Submitit(state)}
+    if name not in made:
+        raise ConfigError(f"unknown launcher {name!r}; {suggest(name, made)}")
+    return made[name]()
+
+
+def each(
+    starts: Callable[[Job], int], stop: Callable[[], None], jobs: Sequence[Job], at_once: int
+) -> Iterator[tuple[Job, int]]:
+    """The jobs with their exit status, as they end. Where the caller is stopped, they are stopped as well."""
+    with ThreadPoolExecutor(at_once) as pool:
+        waiting: dict[Future[int], Job] = {pool.submit(starts, job): job for job in jobs}
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            stop()
+
+
+class Local:
+    """Processes of this machine."""
+
+    def __init__(self) -> None:
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock, self._stopped = threading.Lock(), False
+
+    def call(self, job: Job) -> int:
+        with job.log.open("ab") as log, self._lock:
+            if self._stopped:
+                return 130
+            process = subprocess.Popen(
+                job.command(),
+                env=_environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C is for this process, which stops the others in good order
+            )
+            self._running.add(process)
+        status = process.wait()
+        self._running.discard(process)
+        return status
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            left = list(self._running)
+        for process in left:
+            process.send_signal(signal.SIGINT)
+        for process in left:
+            try:
+                process.wait(STOPPING)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+class Submitit:
+    """Jobs of submitit: on Slurm where there is one, else processes of this machine."""
+
+    def __init__(self, state: Path) -> None:
+        import submitit
+
+        self._executor = submitit.AutoExecutor(folder=state)
+        self._executor.update_parameters(timeout_min=60 * HOURS, name="prefrl", cpus_per_task=1)
+        self._running: set[Any] = set()
+        self._lock, self._stopped = threading.Lock(), False
+
+    def call(self, job: Job) -> int:
+        with self._lock:
+            if self._stopped:
+                return 130
+            sent = self._executor.submit(_called, job.command(), str(job.log))
+            self._running.add(sent)
+        sent.wait()
+        self._running.discard(sent)
+        return int(sent.result()) if sent.exception() is None else 1
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            for sent in self._running:
+                sent.cancel(check=False)
+
+
+def _called(command: list[str], log: str) -> int:
+    with open(log, "ab") as file:
+        return subprocess.call(command, env=_environment(), stdin=subprocess.DEVNULL, stdout=file, stderr=file)
+
+
+def _environment() -> dict[str, str]:
+    return {"OMP_NUM_THREADS": "1"} | os.environ

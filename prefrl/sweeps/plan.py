@@ -1,0 +1,79 @@
+"""Which runs a sweep is made of: presets, a grid of settings, seeds."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from pydantic import Field, ValidationError
+
+from prefrl.components import ConfigError, Settings
+from prefrl.config import Config
+
+
+class Member(NamedTuple):
+    """One run of a sweep."""
+
+    name: str
+    """Of its folder, within the sweep's."""
+    source: str
+    """A preset or a YAML file."""
+    overrides: tuple[str, ...]
+    """Its seed among them."""
+
+
+class SweepPlan(Settings):
+    """Every preset, with every combination of the grid's values, for every seed."""
+
+    presets: tuple[str, ...] = Field(min_length=1)
+    """Presets or YAML files; these are taken from the working directory where they are relative."""
+    seeds: int = Field(5, ge=1)
+    """How many runs of each."""
+    first: int = Field(0, ge=0)
+    """The first seed; the others follow it."""
+    set: tuple[str, ...] = ()
+    """Settings of all runs, as `dotted.key=value`."""
+    grid: dict[str, tuple[Any, ...]] = Field({})
+    """Settings and the values that they take: all combinations are run."""
+
+    @classmethod
+    def load(cls, path: Path) -> SweepPlan:
+        """Read a YAML file. Raises `ConfigError`."""
+        try:
+            data = yaml.safe_load(path.read_text(encoding="utf-8"))
+            return cls.model_validate(data)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{path}: not valid YAML: {error}") from None
+        except ValidationError as error:
+            lines = (f"{path}: {'.'.join(map(str, e['loc'])) or 'all of it'}: {e['msg']}" for e in error.errors())
+            raise ConfigError("\n".join(lines)) from None
+
+    def members(self) -> list[Member]:
+        """All runs, the seeds of one variant after another's.
+
+        The settings of each are built, so that a mistake is told before anything is started. Raises `ConfigError`.
+        """
+        found = []
+        for source, values in product(self.presets, product(*self.grid.values())):
+            chosen = [f"{key}={_written(value)}" for key, value in zip(self.grid, values, strict=True)]
+            variant = ",".join([Path(source).stem if Path(source).is_file() else source.replace("/", "-"), *chosen])
+            Config.load(source, [*self.set, *chosen])
+            for seed in range(self.first, self.first + self.seeds):
+                name = f"{_for_a_folder(variant)}/seed-{seed}"
+                found.append(Member(name, source, (*self.set, *chosen, f"seed={seed}")))
+        twice = sorted({m.name for m in found if sum(m.name == other.name for other in found) > 1})
+        if twice:
+            raise ConfigError(f"two runs of the sweep would share the folder {twice[0]}: give their files other names")
+        return found
+
+
+def _written(value: Any) -> str:
+    """A value as an override says it: YAML in one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10**6).removesuffix("\n").removesuffix("\n...")
+
+
+def _for_a_folder(variant: str) -> str:
+    return re.sub(r"[^\w.,=+-]", "_", variant)[:200]
