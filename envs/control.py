@@ -110,7 +110,10 @@ class ControlSettings(Settings):
     def _make(self) -> tuple[Make, gymnasium.Env[Any, Any]]:
         # Looked up here, not by gymnasium: an id "module:name" would make it import code that a config names.
         if self.env not in gymnasium.registry:
-            raise ConfigError(f"task.env: unknown gymnasium environment {self.env!r}; {_nearest(self.env)}")
+            raise ConfigError(
+                f"task.env: unknown gymnasium environment {self.env!r}; {_nearest(self.env)} (one of your own is "
+                "known once its module is named in the command: prefrl --plugin my_env.py ...)"
+            )
         options: dict[str, Any] = {"max_episode_steps": self._horizon(), "disable_env_checker": True}
         try:
             probe = make(self.env, **options)

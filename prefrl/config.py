@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -99,7 +99,12 @@ class Config(Settings):
 
         Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
         """
-        return cls._changed(_read(source), overrides)
+        data = _read(source)
+        try:
+            return cls._changed(data, overrides)
+        except ConfigError as error:
+            given = {override.partition("=")[0] for override in overrides}
+            raise ConfigError("\n".join(_placed(line, source, given) for line in str(error).splitlines())) from None
 
     @classmethod
     def reopen(cls, path: Path, overrides: Sequence[str] = ()) -> Config:
@@ -205,11 +210,34 @@ def _read(source: str | Path) -> Json:
         raise ConfigError(f"{source}: no such preset or file; {suggest(str(source), known)}")
     try:
         data = yaml.load(text, _UniqueKeys)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError(f"{_at(source, error)}: not valid YAML: {error.problem}") from None
     except yaml.YAMLError as error:
         raise ConfigError(f"{source}: not valid YAML: {error}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{source}: expected settings (key: value), got {type(data).__name__}")
     return data
+
+
+def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
+    mark = error.problem_mark or error.context_mark
+    return f"{source}, line {mark.line + 1}" if mark else str(source)
+
+
+def _placed(line: str, source: str | Path, given: Collection[str]) -> str:
+    """What is said of a setting, with the line of the file that has it; unless it came as an override."""
+    path = Path(source)
+    names = line.partition(":")[0].split(".")
+    if not path.is_file() or ".".join(names) in given:
+        return line
+    node, at = yaml.compose(path.read_text(encoding="utf-8"), yaml.SafeLoader), None
+    for name in names:
+        keys = node.value if isinstance(node, yaml.MappingNode) else ()
+        found = next(((key, value) for key, value in keys if key.value == name), None)
+        if found is None:
+            break
+        at, node = found[0].start_mark.line + 1, found[1]
+    return f"{source}, line {at}: {line}" if at else f"{source}: {line}"
 
 
 class _UniqueKeys(yaml.SafeLoader):

@@ -183,6 +183,20 @@ def test_a_bad_file_is_refused_and_runs_no_code(tmp_path: Path, text: str, messa
         Config.load(path)
 
 
+def test_a_mistake_in_a_file_is_told_with_its_line_and_one_in_the_command_without(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("task:\n  kind: point\nreward: {kind: mlp}\nlearner:\n  kind: control\n  polcy: 3\n")
+    with pytest.raises(ConfigError) as caught:
+        Config.load(path, ["loop.rounds=x"])
+    assert str(caught.value).splitlines() == [
+        f"{path}, line 6: learner.polcy: unknown setting; did you mean 'policy'?",
+        "loop.rounds: expected integer, got 'x'",
+    ]
+    path.write_text("task: {kind: point}\nreward: [a\nlearner: 3")
+    with pytest.raises(ConfigError, match=r"mine\.yaml, line 3: not valid YAML"):
+        Config.load(path)
+
+
 def test_a_missing_extra_names_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(_: str) -> object:
         raise ModuleNotFoundError("No module named 'stable_baselines3'", name="stable_baselines3")

@@ -87,6 +87,8 @@ def test_every_block_runs(path: Path, workshop: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(workshop)
     for language, code in blocks(path):
         if language == "python":
+            if named := re.match(r"# (\w+\.py)\n", code):  # the file that the commands after it speak of
+                (workshop / named[1]).write_text(code)
             exec(compile(code, str(path), "exec"), {"__name__": "__main__"})
         else:
             lines = [line for line in code.splitlines() if line.split("#")[0].strip() not in RUN_BY_CI]

@@ -18,6 +18,7 @@ from prefrl.cli.exchange import commands as exchange_commands
 from prefrl.cli.film import commands as film_commands
 from prefrl.cli.many import Jobs, drive_all, over_seeds
 from prefrl.cli.many import commands as many_commands
+from prefrl.cli.own import by_name, load
 from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
 
@@ -55,6 +56,16 @@ FEW = 20
 """With fewer held-out comparisons than this an accuracy is mostly luck."""
 
 
+@app.callback()
+def own(
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(help="A Python file (my_env.py) or module of your own to load first: environments, kinds."),
+    ] = None,
+) -> None:
+    load(plugin or [])
+
+
 @app.command()
 def run(
     source: Source,
@@ -73,11 +84,12 @@ def run(
     from prefrl.cli.console import drive, say
     from prefrl.rundir import Run
 
+    overrides = by_name(overrides or [])
     config = _load(source, overrides)
     _refuse(seeds > 1 and ranks > 1, "--seeds and --ranks are two ways to use several processes: choose one")
     _refuse(jobs > 1 and seeds == 1, "--jobs goes with --seeds: how many of its runs go on at once")
     if seeds > 1 and not dry_run:
-        drive_all(over_seeds(source, overrides or [], seeds), out or _new_folder(source), jobs, "local")
+        drive_all(over_seeds(source, overrides, seeds), out or _new_folder(source), jobs, "local")
         return
     if dry_run:
         _dry_run(config)
@@ -387,9 +399,10 @@ def _load(source: str, overrides: list[str] | None) -> Config:
     """Settings from a preset, a file, or a folder that holds a config.yaml."""
     from prefrl.config import Config
 
+    changes = by_name(overrides or [])
     if Path(source).is_dir():
-        return Config.reopen(Path(source) / "config.yaml", overrides or [])
-    return Config.load(source, overrides or [])
+        return Config.reopen(Path(source) / "config.yaml", changes)
+    return Config.load(source, changes)
 
 
 def _dry_run(config: Config) -> None:

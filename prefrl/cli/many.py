@@ -61,12 +61,13 @@ def over_seeds(source: str, overrides: Sequence[str], seeds: int) -> SweepPlan:
 def drive_all(plan: SweepPlan, folder: Path, at_once: int, where: str) -> None:
     """Run a sweep to its end, a line for each run, and compare what came of it. Raises `RunError` if a run failed."""
     from prefrl.cli.console import counted, say
+    from prefrl.cli.own import options
     from prefrl.report.comparison import write_comparison
     from prefrl.rundir import RunError
     from prefrl.sweeps.drive import Sweep
     from prefrl.sweeps.launch import launcher
 
-    sweep, failed = Sweep(plan, folder), list[Path]()
+    sweep, failed = Sweep(plan, folder, options()), list[Path]()
     left = len(sweep.jobs)
     if left < len(sweep.members):
         say(f"{len(sweep.members) - left} of {len(sweep.members)} runs in {folder} are finished")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,9 +33,11 @@ class Ended(NamedTuple):
 class Sweep:
     """The folder of a sweep. A folder with another plan is refused, unless the plan holds all of its runs."""
 
-    def __init__(self, plan: SweepPlan, folder: Path) -> None:
-        """Raises `ConfigError` for a wrong setting of any run, and `RunError` for a folder of something else."""
-        self.folder, self.members = folder, plan.members()
+    def __init__(self, plan: SweepPlan, folder: Path, options: Sequence[str] = ()) -> None:
+        """`options`: of `prefrl` itself, that come before each command, such as `--plugin my_env.py`.
+
+        Raises `ConfigError` for a wrong setting of any run, and `RunError` for a folder of something else."""
+        self.folder, self.members, self._options = folder, plan.members(), tuple(options)
         if (folder / "config.yaml").exists():
             raise RunError(f"{folder} holds a single run: choose another folder")
         there = folder / PLAN
@@ -48,7 +50,10 @@ class Sweep:
     @property
     def jobs(self) -> list[Job]:
         """What is not finished yet."""
-        jobs = [Job(member, self.folder / member.name, self.folder / f"{member.name}.log") for member in self.members]
+        jobs = [
+            Job(member, self.folder / member.name, self.folder / f"{member.name}.log", self._options)
+            for member in self.members
+        ]
         return [job for job in jobs if not finished(job.folder)]
 
     def run(self, launcher: Launcher, at_once: int) -> Iterator[Ended]:

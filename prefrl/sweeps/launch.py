@@ -32,10 +32,12 @@ class Job(NamedTuple):
     folder: Path
     log: Path
     """Takes what the command says."""
+    options: tuple[str, ...] = ()
+    """Of `prefrl` itself."""
 
     def command(self) -> list[str]:
-        python = [sys.executable, "-m", "prefrl", "run"]
-        return [*python, self.member.source, *self.member.overrides, "--out", str(self.folder)]
+        run = [sys.executable, "-m", "prefrl", *self.options, "run"]
+        return [*run, self.member.source, *self.member.overrides, "--out", str(self.folder)]
 
 
 class Launcher(Protocol):
