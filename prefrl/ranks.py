@@ -125,7 +125,7 @@ def shared(loop: Loop[C]) -> Loop[C]:
         loop.learner.check_ranks(size)
         return replace(loop, fit=fit_once)
     name = type(loop.learner).__name__
-    text(loop.task, f"{size} ranks cannot share the work of a {name}, but that of learner.kind=control, or on text")
+    text(loop.task, f"{size} ranks can share the learner {name} on text alone (of control, learner.kind=control)")
     return loop
 
 
