@@ -235,7 +235,7 @@ def _environments(
 def _can_be_parted(name: str, after: AfterEnd) -> bool:
     """Whether some of the environments fare as they do among all, without the others.
 
-    Those in NumPy could be made to: but stepping all of them costs less than telling others what came of some.
+    Those in NumPy could be made to: but all of them take about as long as half of them.
     """
     if name in WORLDS:
         return after == "restart"
