@@ -203,20 +203,20 @@ def _digest(*parts: Learner[C] | RewardModel[C]) -> str:
     """Of everything that was learned."""
     found = hashlib.sha256()
     for part in parts:
-        for tensor in _tensors(part.state()):
-            found.update(to_numpy(tensor.contiguous().flatten().view(torch.uint8)).tobytes())
+        for array in _arrays(part.state()):
+            found.update(array.tobytes())
     return found.hexdigest()
 
 
-def _tensors(state: object) -> Iterator[torch.Tensor]:
-    """Arrays too."""
+def _arrays(state: object) -> Iterator[np.ndarray]:
+    """What is in a state, tensors as bytes."""
     if isinstance(state, dict):
         for key in state:
-            yield from _tensors(state[key])
+            yield from _arrays(state[key])
     elif isinstance(state, list | tuple):
         for value in state:
-            yield from _tensors(value)
+            yield from _arrays(value)
     elif isinstance(state, torch.Tensor):
-        yield state
+        yield to_numpy(state.contiguous().flatten().view(torch.uint8))
     elif isinstance(state, np.ndarray):
-        yield torch.from_numpy(state)
+        yield state
