@@ -91,6 +91,8 @@ class ControlSettings(Settings):
         environments = partial(_environments, name, plain, horizon, after, self.step_seconds)
         if self.hide or self.flicker or self.stack > 1:
             environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)
+        # Blindness is drawn for all at once.
+        parted = not self.flicker and _can_be_parted(name, after)
         for one in (probe, env):
             one.close()
         segment, notes = self._segment_steps(horizon, fps)
@@ -104,6 +106,7 @@ class ControlSettings(Settings):
             fps=fps or 30.0,
             frame_size=self.frame_size,
             make=environments,
+            part=environments if parted else None,
             notes=notes,
         )
 
@@ -193,6 +196,7 @@ class GymnasiumTask:
     fps: float
     frame_size: int
     make: Callable[[int], Environments]
+    part: Callable[[int, range], Environments] | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -202,6 +206,9 @@ class GymnasiumTask:
     def environments(self, count: int) -> Environments:
         return self.make(count)
 
+    def some_environments(self, count: int, which: range) -> Environments | None:
+        return None if self.part is None else self.part(count, which)
+
     def frames(self, segment: Segment) -> np.ndarray:
         from prefrl.envs.render import frames
 
@@ -209,24 +216,44 @@ class GymnasiumTask:
 
 
 def _environments(
-    name: str, single: Make, horizon: int, after: AfterEnd, seconds: float | None, count: int
+    name: str,
+    single: Make,
+    horizon: int,
+    after: AfterEnd,
+    seconds: float | None,
+    count: int,
+    which: range | None = None,
 ) -> Environments:
     """The fastest stepper there is for an environment."""
-    if after == "restart":  # the others know no fresh start within an episode
-        return Wrapped(single, count, horizon, after, seconds)
-    if name in WORLDS:
+    if name in WORLDS and after != "restart":  # which the fast ones do not know within an episode
+        assert which is None
         return Vectorised(WORLDS[name](after == "end"), count, horizon)
-    if name in BODIES:
+    if name in BODIES and after != "restart":
         from prefrl.envs.fast.simulated import Simulated
 
-        return Simulated(name, single, count, horizon, after != "end")
-    return Wrapped(single, count, horizon, after, seconds)
+        return Simulated(name, single, count, horizon, after != "end", which)
+    return Wrapped(single, count, horizon, after, seconds, which)
+
+
+def _can_be_parted(name: str, after: AfterEnd) -> bool:
+    """Whether some of the environments fare as they do among all, without the others.
+
+    Those in NumPy could be made to: but all of them take about as long as half of them.
+    """
+    if name in WORLDS:
+        return after == "restart"
+    return name not in BODIES or after != "end"  # first states are drawn as episodes end, of all bodies by turns
 
 
 def _partial(
-    make: Callable[[int], Environments], size: int, hide: tuple[int, ...], flicker: float, stack: int, count: int
+    make: Callable[..., Environments],
+    size: int,
+    hide: tuple[int, ...],
+    flicker: float,
+    stack: int,
+    *which: Any,
 ) -> Environments:
-    return Partial(make(count), size, hide, flicker, stack)
+    return Partial(make(*which), size, hide, flicker, stack)
 
 
 def _keywords(env: type) -> list[str]:

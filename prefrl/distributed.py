@@ -1,9 +1,10 @@
 """Several processes on one computation: who is who, and what they share.
 
 Every rank holds the same batch, the same parameters and the same generators; only what is dear is shared out, by rows
-(a prompt to answer, a response to score or to learn from): each rank computes its own, and all get the whole. So
-counts, baselines, minibatches and metrics are of the whole batch wherever they are computed, and no result hangs on the
-number of ranks but by rounding. A process by itself is a world of one, where all of this does nothing.
+(a prompt to answer, a response to score or to learn from, an environment to step): each rank computes its own, and all
+get the whole. So counts, baselines, minibatches and metrics are of the whole batch wherever they are computed, and no
+result hangs on the number of ranks but by rounding. A process by itself is a world of one, where all of this does
+nothing.
 """
 
 from __future__ import annotations
@@ -77,6 +78,22 @@ class World:
         found: list[T | None] = [None] * self.size
         with _heard():
             dist.all_gather_object(found, mine)
+        return cast("list[T]", found)
+
+    def share(self, count: int) -> range:
+        """This rank's of `count` things that each stay with one rank: neighbours, as many on each rank as can be."""
+        return range(self.rank * count // self.size, (self.rank + 1) * count // self.size)
+
+    def each(self, call: Callable[[], T]) -> list[T]:
+        """What `call` returns on each rank, in their order; what it raises on any of them, all raise."""
+        if self.size == 1:
+            return [call()]
+        with alone():  # others may do something else meanwhile
+            mine = _outcome(call)
+        found = self.gathered(mine)
+        for one in found:
+            if isinstance(one, Exception):
+                raise one
         return cast("list[T]", found)
 
     def sum_gradients(self, parameters: Iterable[torch.nn.Parameter]) -> None:

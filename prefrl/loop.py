@@ -5,12 +5,13 @@ It knows nothing of control or text: what is particular is in the task and the l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Generic, Literal
+from typing import Generic, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field
 
 from prefrl.components import Settings
@@ -19,6 +20,9 @@ from prefrl.fit.settings import FittingSettings
 from prefrl.protocols import Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
 from prefrl.seeding import Streams, streams, threads
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
+
+Fit: TypeAlias = Callable[[RewardModel[C], Store[C], FittingSettings, np.random.Generator, Sequence[C]], Fitted]
+"""What `prefrl.fit.trainer.fit` does."""
 
 
 class LoopSettings(Settings):
@@ -72,6 +76,8 @@ class Loop(Generic[C]):
     seed: int = 0
     threads: int | None = None
     """With how many threads torch and BLAS compute; None leaves that to them."""
+    fit: Fit[C] | None = None
+    """How stage 3 is done; None for `prefrl.fit.trainer.fit`."""
     round: int = -1
     """The last round that is done; 0 is the evaluation of the starting policy, -1 is nothing yet."""
     sequence: int = 0
@@ -153,7 +159,7 @@ class Loop(Generic[C]):
 
         with self._timed("fit"):
             try:
-                fitted = fit(self.reward, self.store, self.fitting, rng.fit, pool)
+                fitted = (self.fit or fit)(self.reward, self.store, self.fitting, rng.fit, pool)
             except NothingToFit as error:  # people may not have answered yet: what is known stays
                 if self.settings.labels:
                     self._notes.append(f"nothing to fit: {error}")

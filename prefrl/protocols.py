@@ -150,6 +150,17 @@ class ControlTask(Task, Protocol):
 
 
 @runtime_checkable
+class Parted(Protocol):
+    """A task of control whose environments several ranks can share."""
+
+    def some_environments(self, count: int, which: range) -> Environments | None:
+        """Those in `which` of `count` environments, to which the same happens as among all of them.
+
+        They draw from the generator of `reset` what all of them would. None where that cannot be, or does not pay.
+        """
+
+
+@runtime_checkable
 class Recorded(Protocol):
     """A task of control whose simulator is not there: its behaviours are those of a file."""
 
@@ -500,6 +511,14 @@ class Acts(Protocol):
 
 
 @runtime_checkable
+class Divides(Protocol):
+    """A learner of control whose work several ranks can share."""
+
+    def check_ranks(self, count: int) -> None:
+        """Raises `ConfigError` where so many cannot share it, before anybody is asked."""
+
+
+@runtime_checkable
 class Paced(Protocol):
     """A learner whose learning rate falls over the run."""
 
@@ -556,6 +575,7 @@ class SelectorSettings(Protocol):
 __all__ = [
     "Attended",
     "ControlTask",
+    "Divides",
     "Dynamics",
     "Environments",
     "Inputs",
@@ -565,6 +585,7 @@ __all__ = [
     "Learner",
     "Noted",
     "LearnerSettings",
+    "Parted",
     "Particular",
     "Policy",
     "Recorded",

@@ -1,7 +1,8 @@
 """One run on several ranks: rank 0 has the folder, the store, the labeler and the selector; all the others follow.
 
 Every rank goes through the same `Loop`. What belongs to rank 0 is asked there, and all are told what it answered; what
-samples, fits, improves and evaluates shares its rows (`prefrl.distributed`).
+samples, fits, improves and evaluates shares its rows (`prefrl.distributed`). In control only environments are dear
+(`prefrl.policies.divided`): rank 0 fits and learns, and the others take over what it has learned.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import torch
 
 from prefrl.components import Settings
 from prefrl.distributed import each_tensor, heard_by_torch, joined, together, world
+from prefrl.fit.settings import FittingSettings
+from prefrl.fit.trainer import fit
 from prefrl.judgements import Answer, Judged
 from prefrl.loop import Loop
-from prefrl.protocols import Attended, Labeler, Learner, RewardModel, Selector, Store, text
+from prefrl.protocols import Attended, Divides, Labeler, Learner, RewardModel, Selector, Store, text
 from prefrl.seeding import to_host, to_numpy
-from prefrl.types import C, Floats, Json, Query, Round
+from prefrl.types import C, Fitted, Floats, Json, Query, Round
 
 
 class RanksError(RuntimeError):
@@ -106,17 +109,46 @@ class SharedSelector(Generic[C]):
 def shared(loop: Loop[C]) -> Loop[C]:
     """The same loop, or where there are several ranks, one that they go through together.
 
-    Other ranks than the first never look at their own store. Raises `ConfigError` where the kind of task is not shared.
+    Other ranks than the first never look at their own store. Raises `ConfigError` where the work of a learner cannot be
+    shared, or not by so many.
     """
-    if joined().size == 1:
+    size = joined().size
+    if size == 1:
         return loop
-    text(loop.task, f"{joined().size} ranks share the work on text alone")
-    return replace(
+    loop = replace(
         loop,
         store=SharedStore(loop.store),
         labeler=SharedLabeler(loop.labeler),
         selector=SharedSelector(loop.selector),
     )
+    if isinstance(loop.learner, Divides):
+        loop.learner.check_ranks(size)
+        return replace(loop, fit=fit_once)
+    name = type(loop.learner).__name__
+    text(loop.task, f"{size} ranks can share the learner {name} on text alone (of control, learner.kind=control)")
+    return loop
+
+
+def fit_once(
+    reward: RewardModel[C],
+    store: Store[C],
+    fitting: FittingSettings,
+    rng: np.random.Generator,
+    unjudged: Sequence[C] = (),
+) -> Fitted:
+    """`prefrl.fit.trainer.fit` on rank 0, whose reward model the others take over.
+
+    For small ones that takes less time than adding up gradients in every step, and the result has the same bits on any
+    number of ranks. `rng` is not used again.
+    """
+    assert isinstance(store, SharedStore)
+    own = store.own
+    fitted, state = world().first(
+        lambda: (fit(reward, own, fitting, rng, unjudged), each_tensor(reward.state(), to_host))
+    )
+    if world().rank:
+        reward.load(state)
+    return fitted
 
 
 def lead(settings: Json, loop: Loop[C]) -> None:
@@ -171,17 +203,20 @@ def _digest(*parts: Learner[C] | RewardModel[C]) -> str:
     """Of everything that was learned."""
     found = hashlib.sha256()
     for part in parts:
-        for tensor in _tensors(part.state()):
-            found.update(to_numpy(tensor.contiguous().flatten().view(torch.uint8)).tobytes())
+        for array in _arrays(part.state()):
+            found.update(array.tobytes())
     return found.hexdigest()
 
 
-def _tensors(state: object) -> Iterator[torch.Tensor]:
+def _arrays(state: object) -> Iterator[np.ndarray]:
+    """What is in a state, tensors as bytes."""
     if isinstance(state, dict):
         for key in state:
-            yield from _tensors(state[key])
+            yield from _arrays(state[key])
     elif isinstance(state, list | tuple):
         for value in state:
-            yield from _tensors(value)
+            yield from _arrays(value)
     elif isinstance(state, torch.Tensor):
+        yield to_numpy(state.contiguous().flatten().view(torch.uint8))
+    elif isinstance(state, np.ndarray):
         yield state

@@ -16,16 +16,21 @@ from torch.distributed.tensor import DTensor
 
 from prefrl import distributed
 from prefrl.components import settings_class
+from prefrl.envs.control import ControlSettings
 from prefrl.evaluate.policies import scored
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
+from prefrl.improve.control import ControlLearnerSettings
 from prefrl.improve.dpo import DPOSettings
 from prefrl.improve.kto import KTOSettings
 from prefrl.improve.online_dpo import OnlineDPOSettings
 from prefrl.improve.raft import RAFTSettings
 from prefrl.improve.text import TextLearnerSettings
 from prefrl.judgements import Comparison, Judged
+from prefrl.policies.divided import Divided, environments
+from prefrl.policies.rollout import collect
 from prefrl.protocols import RewardModel
+from prefrl.reward_models.mlp import MLPSettings
 from prefrl.types import Query, Response, Segment, State
 
 Found: TypeAlias = dict[str, Tensor]
@@ -81,6 +86,17 @@ def pieces() -> Found:
         world.first(fail)
     except ValueError as error:
         found["error"] = torch.tensor(list(str(error).encode()))
+    found["share"] = torch.tensor(list(world.share(7)))
+    found["each"] = torch.tensor(world.each(lambda: [world.rank, distributed.world().size]))
+
+    def fail_elsewhere() -> None:
+        if world.rank == world.size - 1:
+            raise ValueError(f"said by rank {world.rank}")
+
+    try:
+        world.each(fail_elsewhere)
+    except ValueError as error:
+        found["error of one"] = torch.tensor(list(str(error).encode()))
     return found | {"calls": torch.tensor([len(calls)])}
 
 
@@ -210,6 +226,52 @@ def rewards(cache: Path) -> Found:
             if kind == "transformer":  # one response, which not every rank has
                 found[f"{kind} of {members}: one"] = torch.from_numpy(scored(reward, pairs[0].query.candidates[:1]))
     return found
+
+
+WORLDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "bodies": ({"env": "InvertedPendulum-v5"}, {}),
+    "bodies with a memory": ({"env": "InvertedPendulum-v5", "hide": [2, 3]}, {"kind": "gru", "width": 8, "chunk": 4}),
+    "any environment": ({"env": "Pendulum-v1", "options": {"g": 9.0}}, {}),
+    "in NumPy": ({"env": "CartPole-v1"}, {"hidden": [8]}),
+}
+"""Tasks of control, and policies for them."""
+
+
+def controls() -> Found:
+    """Parameters, segments, metrics and steps of a learner of control after two rounds; and how a fault comes out."""
+    found: Found = {}
+    for name, (world, policy) in WORLDS.items():
+        task = ControlSettings.model_validate({"horizon": 12, "segment_steps": 3, **world}).build()
+        settings = {"environments": 5, "steps_per_round": 100, "rollout_steps": 10, "minibatch": 20, "epochs": 2}
+        learner = ControlLearnerSettings.model_validate(
+            settings | {"evaluation_episodes": 3, "critic_epochs": 1, "policy": policy}
+        ).build(task, np.random.default_rng(0))
+        reward = MLPSettings(hidden=(8,)).build(task, np.random.default_rng(1))
+        for number in range(2):
+            segments = learner.sample(20, np.random.default_rng([2, number]))
+            rng = np.random.default_rng([3, number])
+            metrics = learner.improve(reward, None, rng)  # type: ignore[arg-type]
+            evaluated = learner.evaluate(reward, np.random.default_rng(4)).metrics
+            found[f"{name}: metrics {number}"] = torch.tensor([*metrics.values(), *evaluated.values()])
+            found[f"{name}: drawn {number}"] = torch.tensor(rng.random(2))
+            found[f"{name}: segments {number}"] = torch.tensor([list(bytes.fromhex(one.id)) for one in segments])
+        found[f"{name}: parameters"] = torch.cat([p.detach().flatten() for p in learner.policy.parameters()])
+        found[f"{name}: steps"] = torch.tensor(learner.steps)
+    return found | _fault()
+
+
+def _fault() -> Found:
+    """Which of five environments are this rank's, and what is said where the last one goes wrong."""
+    task = ControlSettings(env="Pendulum-v1", options={"g": 9.0}, segment_steps=3).build()
+    envs, actions = environments(task, 5), np.zeros((5, 1), np.float32)
+    own = np.arange(5)[envs.mine] if isinstance(envs, Divided) else np.arange(5)
+    if 4 in own:
+        actions[4] = np.nan
+    try:
+        collect(envs, envs.reset(np.random.default_rng(0)), 4, lambda *_: (actions, actions))
+    except FloatingPointError as error:
+        return {"own": torch.from_numpy(own), "fault": torch.tensor(list(str(error).encode()))}
+    return {}
 
 
 class ControlTask:

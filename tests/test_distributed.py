@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from rank_cases import Work, on_ranks, pieces, policies, rewards, spread_out
+from rank_cases import Work, controls, on_ranks, pieces, policies, rewards, spread_out
 
 from prefrl import distributed
 from prefrl.distributed import World
@@ -40,6 +40,9 @@ def test_ranks_share_rows_sum_gradients_and_hear_what_the_first_has_to_say(tmp_p
         assert one["first"].tolist() == [40, 0]  # rank 0 says it, in a world of its own
         assert bytes(one["error"].tolist()) == b"said by rank 0"
         assert one["calls"].tolist() == [2 if rank == 0 else 0]
+        assert one["share"].tolist() == [[0, 1], [2, 3], [4, 5, 6]][rank]  # neighbours
+        assert one["each"].tolist() == [[0, 1], [1, 1], [2, 1]]  # each in a world of its own
+        assert bytes(one["error of one"].tolist()) == b"said by rank 2"
 
 
 @pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.slow)])
@@ -57,6 +60,17 @@ def test_an_update_is_the_same_on_any_number_of_ranks(
         apart = float(((found[0][name] - expected) * known).norm() / expected.norm())
         # Float32 itself: the gradient with adapters is 2e-6 from the one in float64, on one rank as on two.
         assert apart <= 5e-6, f"{name}: {apart:.2g} from one rank"
+
+
+def test_control_is_the_same_to_the_bit_on_two_ranks_that_have_two_and_three_environments(tmp_path: Path) -> None:
+    alone = controls()
+    assert b"environment 4 in step 0 of the rollout" in bytes(alone["fault"].tolist())
+    ranks, whole = on_ranks(2, tmp_path / "ranks", controls), alone.pop("own").tolist()
+    assert [found.pop("own").tolist() for found in ranks] == [whole[:2], whole[2:]]
+    for found in ranks:
+        assert found.keys() == alone.keys()
+        for name, expected in alone.items():
+            assert torch.equal(found[name], expected), name
 
 
 def test_weights_that_are_spread_over_ranks_learn_as_whole_ones_do(

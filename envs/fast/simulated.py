@@ -50,6 +50,10 @@ class Bodies:
         mujoco.mj_forward(self._model, data)  # what is derived from positions and velocities must follow them
         self._read(i)
 
+    def skip(self, rng: np.random.Generator) -> None:
+        """Draw what the start of an episode draws, for one that is stepped elsewhere."""
+        self._body.start(*self._first, rng)
+
     def advance(self, actions: Floats, which: Iterable[int]) -> tuple[Floats, Bools]:
         """One step of those in `which`: (n,) rewards and health. Those of the others mean nothing."""
         body, now = self._body, self.now
@@ -81,21 +85,31 @@ class Simulated:
     InvertedPendulum and InvertedDoublePendulum have no such option, and go on all the same: in the simulator, with
     the reward that gymnasium computes for each step. That is 1 while the single pole is up and 0 when it has fallen;
     the double one's bonus of 10 is for steps that end with its tip up, its penalties for all.
+
+    With `mine` only those of the n are here, and start as they do among all. That needs a fixed horizon: first states
+    are drawn one after another, and what others have drawn is only known where all episodes end at once.
     """
 
     def __init__(
-        self, name: str, make: Callable[[], gymnasium.Env[Any, Any]], count: int, horizon: int, fixed_horizon: bool
+        self,
+        name: str,
+        make: Callable[[], gymnasium.Env[Any, Any]],
+        count: int,
+        horizon: int,
+        fixed_horizon: bool,
+        mine: range | None = None,
     ) -> None:
-        self._bodies = Bodies(name, make().unwrapped, count)
-        self._elapsed = np.zeros(count, np.int64)
+        assert mine is None or fixed_horizon
+        self._count, self._mine = count, range(count) if mine is None else mine
+        self._bodies = Bodies(name, make().unwrapped, len(self._mine))
+        self._elapsed = np.zeros(len(self._mine), np.int64)
         self._horizon = horizon
         self._terminate = not fixed_horizon
         self._rng = np.random.default_rng(0)
 
     def reset(self, rng: np.random.Generator) -> Floats:
         self._rng = rng
-        for i in range(len(self._elapsed)):
-            self._start(i)
+        self._start(range(self._count))
         return self._observe()
 
     def step(self, actions: Floats) -> Transition:
@@ -104,10 +118,9 @@ class Simulated:
         terminated = ~healthy & self._terminate
         truncated = (self._elapsed >= self._horizon) & ~terminated
         final = observations = self._observe()
-        ended = np.flatnonzero(terminated | truncated)
-        for i in ended.tolist():
-            self._start(i)
-        if len(ended):
+        if (terminated | truncated).any():
+            # Those that others step end when these do: there are others with a fixed horizon alone.
+            self._start(np.flatnonzero(terminated | truncated).tolist() if self._terminate else range(self._count))
             observations = self._observe()
         return Transition(observations, rewards, terminated, truncated, final)
 
@@ -117,9 +130,14 @@ class Simulated:
     def legal(self) -> Bools | None:
         return None
 
-    def _start(self, i: int) -> None:
-        self._bodies.start(i, self._rng)
-        self._elapsed[i] = 0
+    def _start(self, which: Iterable[int]) -> None:
+        """Begin episodes, of all n."""
+        for i in which:
+            if i in self._mine:
+                self._bodies.start(i - self._mine.start, self._rng)
+                self._elapsed[i - self._mine.start] = 0
+            else:
+                self._bodies.skip(self._rng)
 
     def _observe(self) -> Floats:
         return self._bodies.observe().astype(np.float32)

@@ -28,6 +28,8 @@ class Wrapped:
     Raises `EnvironmentFault`, which names the environment and its step, where one raises, gives an observation of
     another shape or type than its first, or a reward that is not finite. A call that takes longer than `step_seconds`
     ends the process.
+
+    With `mine` only those of the n are here. Each has a generator of its own, and fares as it does among all.
     """
 
     def __init__(
@@ -37,20 +39,23 @@ class Wrapped:
         horizon: int,
         after: AfterEnd,
         step_seconds: float | None = None,
+        mine: range | None = None,
     ) -> None:
-        self._envs = [build() for _ in range(count)]
+        self._all, self._mine = count, range(count) if mine is None else mine
+        self._envs = [build() for _ in self._mine]
         self._seconds = step_seconds
         self._form: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._horizon, self._after = horizon, after
         self._discrete = isinstance(self._envs[0].action_space, gymnasium.spaces.Discrete)
-        self._last: Floats = np.zeros((count, 0), np.float32)
-        self._over = np.zeros(count, bool)
+        self._last: Floats = np.zeros((len(self._mine), 0), np.float32)
+        self._over = np.zeros(len(self._mine), bool)
         """Which episodes the environment has ended, and that go on in their last state."""
-        self._elapsed = np.zeros(count, np.int64)
+        self._elapsed = np.zeros(len(self._mine), np.int64)
 
     def reset(self, rng: np.random.Generator) -> Floats:
         self._over[:], self._elapsed[:] = False, 0
-        first = [self._reset(i, draw_seed(rng)) for i in range(len(self._envs))]
+        seeds = [draw_seed(rng) for _ in range(self._all)]
+        first = [self._reset(i, seeds[number]) for i, number in enumerate(self._mine)]
         self._last = np.stack(first).astype(np.float32)
         return self._last.copy()
 
@@ -76,7 +81,7 @@ class Wrapped:
         return Transition(self._last.copy(), rewards, terminated, truncated & ~terminated, final)
 
     def _reset(self, i: int, seed: int | None = None) -> Floats:
-        with guarded(f"a reset of environment {i}", self._seconds):
+        with guarded(f"a reset of environment {self._mine[i]}", self._seconds):
             observation: Floats = self._envs[i].reset(seed=seed)[0]
         self._check_form(i, observation)
         return observation
@@ -99,7 +104,7 @@ class Wrapped:
             )
 
     def _where(self, i: int) -> str:
-        return f"environment {i}, step {self._elapsed[i]} of its episode"
+        return f"environment {self._mine[i]}, step {self._elapsed[i]} of its episode"
 
     def states(self) -> Floats | None:
         rows = [physics_state(env) for env in self._envs]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from prefrl.store import Store
     from prefrl.types import Json
 
-Ranks = Annotated[int, typer.Option(min=1, help="Processes that share the work, for tasks of text.")]
+Ranks = Annotated[int, typer.Option(min=1, help="Processes that share the work.")]
 MEETING = "PREFRL_MEETING"
 """Names, for a process that was started here, the file in which the ranks meet."""
 GRACE = 10.0

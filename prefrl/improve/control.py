@@ -22,18 +22,20 @@ from pydantic import BeforeValidator, Field, model_validator
 from torch import Tensor
 
 from prefrl.components import ConfigError, Settings, filled_in
+from prefrl.distributed import each_tensor, world
 from prefrl.improve.gradient import Batch, adam_of, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Acting, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
 from prefrl.policies.cnn import CNNPolicySettings
+from prefrl.policies.divided import environments, of_all
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
-from prefrl.seeding import Device, device_of
+from prefrl.seeding import Device, device_of, to_host
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
@@ -217,10 +219,11 @@ class ControlLearner:
         """`steps_per_round` environment steps of learning, from fresh episodes; metrics are means over rollouts.
 
         Those of `gradient.step`, each a mean over a rollout's gradient steps; explained, the share of the returns'
-        variance that the critic explains; and reward, the learned one of a step.
+        variance that the critic explains; and reward, the learned one of a step. Ranks share the environments, and
+        learn from what came of all of them.
         """
         scorer, count = step_rewards(reward), self._settings.environments
-        envs, rollouts, metrics = self._task.environments(count), [], []
+        envs, rollouts, metrics = environments(self._task, count), [], []
         observations, memory, begins = envs.reset(rng), None, None
         lengths = self._rollout_lengths()
         for number, steps in enumerate(lengths):
@@ -232,10 +235,11 @@ class ControlLearner:
                 rollout.truncated[:, -1] |= ~rollout.terminated[:, -1]
             read = partial(self.policy.read, rollout, memory)
             # Only before the first rollout is the reward one that the critic has not seen.
-            metrics.append(self._learn(rollout, read, scorer, rng, self._left(number / len(lengths)), number == 0))
+            learn = partial(self._learn, rollout, read, scorer, rng, self._left(number / len(lengths)), number == 0)
+            metrics.append(self._once(learn, rng))
             rollouts.append(rollout)
             begins = rollout.ends[:, -1]
-            memory = forgotten(act.memory, begins)
+            memory = forgotten(of_all(envs, act.memory), begins)
         # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._player.learned_from(joined(rollouts))
         return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
@@ -248,7 +252,7 @@ class ControlLearner:
         """Go back to the best policy, by the newest reward, where the last round lost clearly (`Best.settle`)."""
         if self._settings.rollback is None:
             return None
-        weights = {"policy": self.policy.state(), "optimizer": deepcopy(self._optimizer.state_dict())}
+        weights = deepcopy(self._weights())
         undone, best = self._player.settle(weights, reward, self._settings.rollback), self._player.best.weights
         if undone is not None and best is not None:
             # From here the same steps might lead to the same loss; the next try, and each one after it, is slower.
@@ -260,9 +264,8 @@ class ControlLearner:
     def go_back(self) -> int:
         best = self._player.best
         if best.weights is not None:
-            self.policy.load(best.weights["policy"])
             # A copy: the optimiser goes on writing into what it is given.
-            self._optimizer.load_state_dict(deepcopy(best.weights["optimizer"]))
+            self._take(deepcopy(best.weights))
         return best.round if best.weights is not None else self._player.rounds
 
     def pace(self, begin: float, end: float) -> None:
@@ -292,13 +295,42 @@ class ControlLearner:
 
     def state(self) -> State:
         self._begin()
-        return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()} | self._player.state()
+        return self._weights() | self._player.state()
 
     def load(self, state: State) -> None:
         self._start = None
-        self.policy.load(state["policy"])
-        self._optimizer.load_state_dict(state["optimizer"])
+        self._take(state)
         self._player.load(state)
+
+    def check_ranks(self, count: int) -> None:
+        if self._settings.environments < count:
+            raise ConfigError(
+                f"{count} ranks share the environments of a learner, and learner.environments is "
+                f"{self._settings.environments}: raise it, or start fewer ranks"
+            )
+
+    def _weights(self) -> State:
+        return {"policy": self.policy.state(), "optimizer": self._optimizer.state_dict()}
+
+    def _take(self, weights: State) -> None:
+        self.policy.load(weights["policy"])
+        self._optimizer.load_state_dict(weights["optimizer"])
+
+    def _once(self, learn: Callable[[], Metrics], rng: np.random.Generator) -> Metrics:
+        """Learn on one rank, and have all know what it has learned.
+
+        For a small network that takes less time than adding up the gradients of all ranks in every step, and it is the
+        same to the bit on any number of them.
+        """
+        if world().size == 1:
+            return learn()
+        metrics, weights, drawn = world().first(
+            lambda: (learn(), each_tensor(self._weights(), to_host), rng.bit_generator.state)
+        )
+        if world().rank:
+            self._take(weights)
+            rng.bit_generator.state = drawn
+        return metrics
 
     def _begin(self) -> None:
         """Take over the policy that this one starts from, once."""

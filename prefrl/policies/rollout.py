@@ -9,6 +9,8 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from prefrl.components import ConfigError
+from prefrl.distributed import world
+from prefrl.policies.divided import Divided, environments
 from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel
 from prefrl.types import Bools, Floats, Segment, State
 
@@ -57,10 +59,10 @@ class Rollout:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def joined(parts: Sequence[Rollout]) -> Rollout:
-    """Rollouts that follow one another, as one."""
+def joined(parts: Sequence[Rollout], axis: int = 1) -> Rollout:
+    """Rollouts that follow one another as one, or for axis 0 those of other environments."""
     arrays: dict[str, list[Any]] = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Rollout)}
-    whole: dict[str, Any] = {k: None if v[0] is None else np.concatenate(v, 1) for k, v in arrays.items()}
+    whole: dict[str, Any] = {k: None if v[0] is None else np.concatenate(v, axis) for k, v in arrays.items()}
     return Rollout(**whole)
 
 
@@ -70,8 +72,23 @@ def collect(
     """Act for `steps` steps from `observations` (n, O); also returns the observations to go on from.
 
     `begins` (n,): which episodes begin with the first step; None where all do. Raises FloatingPointError where an
-    observation or an action is not finite.
+    observation or an action is not finite. Environments that are divided among ranks: all have to come here.
     """
+    if not isinstance(envs, Divided):
+        return _collect(envs, observations, steps, act, begins)
+
+    def own() -> tuple[Rollout, Floats]:
+        rollout, following = _collect(envs, observations, steps, act, begins)
+        rows: dict[str, Any] = {name: None if x is None else x[envs.mine] for name, x in rollout.state().items()}
+        return Rollout(**rows | {"states": rollout.states}), following[envs.mine]
+
+    rollouts, following = zip(*world().each(own), strict=True)
+    return joined(rollouts, 0), np.concatenate(following)
+
+
+def _collect(
+    envs: Environments, observations: Floats, steps: int, act: Act, begins: Bools | None
+) -> tuple[Rollout, Floats]:
     rows = []
     begins = np.ones(len(observations), bool) if begins is None else begins
     for t in range(steps):
@@ -124,7 +141,7 @@ def learned_rewards(reward: StepRewardModel, rollout: Rollout) -> Floats:
 
 def whole_episodes(task: ControlTask, act: Act, episodes: int, rng: np.random.Generator) -> Rollout:
     """One episode in each of `episodes` fresh environments; a row may go on after its first end."""
-    envs = task.environments(episodes)
+    envs = environments(task, episodes)
     parts: list[Rollout] = []
     observations, done = envs.reset(rng), np.zeros(episodes, bool)
     # Blocks, so that it ends soon after the slowest environment; all episodes end at the horizon at the latest.

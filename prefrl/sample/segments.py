@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, collect, joined
 from prefrl.protocols import ControlTask
 from prefrl.types import Floats, Segment
@@ -74,7 +75,7 @@ def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.ra
     # As many equal passes as it takes, over no more environments than are needed to fill them.
     passes = math.ceil(episodes / most)
     n = math.ceil(episodes / passes)
-    envs, parts, held, longest = task.environments(n), list[Rollout](), 0, 0
+    envs, parts, held, longest = environments(task, n), list[Rollout](), 0, 0
     observations, age = envs.reset(rng), np.zeros(n, np.int64)
     while len(parts) < passes or held < count:
         if len(parts) >= PATIENCE * OVERLAP * passes:

@@ -14,11 +14,19 @@ from typing import Any
 import pytest
 from runs import TINY, finish, tiny
 
+from prefrl import distributed
+from prefrl.components import ConfigError
+from prefrl.config import Config
+from prefrl.rundir import Run
 from prefrl.store import Store
 
 TORCHRUN = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
 ROUNDS, EQUAL_ROUNDS = "loop.rounds=8", 4
 SETTINGS = ("text/toy", *TINY["text/toy"], ROUNDS)
+BODIES = (
+    *TINY["control/toy"], ROUNDS, "task.kind=control", "task.env=InvertedPendulum-v5", "task.horizon=20",
+    "task.frame_size=16", "learner.environments=5",
+)  # fmt: skip
 slow = pytest.mark.slow
 WITHIN = 10.0
 """Seconds in which all ranks end once one has."""
@@ -109,11 +117,46 @@ def test_ctrl_c_stops_all_ranks_and_says_how_to_go_on(tmp_path: Path, heard: Non
 
 
 @slow
-def test_control_is_refused_in_one_line(tmp_path: Path) -> None:
-    refused = started("run", "control/toy", "--ranks", "2", "--out", str(tmp_path / "run"), log=tmp_path / "log")
-    assert refused.wait() == 2
+def test_a_run_of_control_that_lost_a_rank_ends_on_one_in_the_bytes_of_one_that_had_no_other(tmp_path: Path) -> None:
+    folder, alone = tmp_path / "run", tmp_path / "alone"
+    first = started("run", "control/toy", *BODIES, "--ranks", "2", "--out", str(folder))
+    while len(rows(folder)) < 3:
+        assert first.poll() is None
+        time.sleep(0.02)
+    (other,) = children(first.pid)
+    os.kill(other, signal.SIGKILL)
+    assert first.wait(WITHIN) != 0
+    finish(Config.load("control/toy", BODIES), alone)
+    assert len(rows(folder)) < len(rows(alone))
+    finish(Config.load("control/toy", BODIES), folder)
+    assert weights(folder) == weights(alone)
+    for one, two in zip(rows(alone), rows(folder), strict=True):
+        timed = {name for name in one if name.startswith("seconds/")}
+        assert {k: v for k, v in one.items() if k not in timed} == {k: v for k, v in two.items() if k not in timed}
+    with Store[Any](alone, write=False) as a, Store[Any](folder, write=False) as b:
+        assert [one.query.id for one in a.judged()] == [one.query.id for one in b.judged()] != []
+
+
+@slow
+def test_what_ranks_cannot_share_is_refused_in_one_line(tmp_path: Path) -> None:
+    few = ("control/toy", "learner.environments=1", "--ranks", "2", "--out", str(tmp_path / "run"))
+    assert started("run", *few, log=tmp_path / "log").wait() == 2
     (line,) = (tmp_path / "log").read_text().splitlines()
-    assert line == "error: 2 ranks share the work on text alone, but the task is of kind 'control'"
+    assert line == (
+        "error: 2 ranks share the environments of a learner, and learner.environments is 1: "
+        "raise it, or start fewer ranks"
+    )
+
+
+def test_learners_that_ranks_cannot_share_are_refused_by_name_before_anything_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(distributed, "_joined", distributed.World(0, 2))
+    config = Config.parse({"task": {"kind": "point"}, "reward": {"kind": "mlp"}, "learner": {"kind": "sb3"}})
+    with pytest.raises(ConfigError, match="2 ranks can share the learner SB3 on text alone"):
+        Run(config, tmp_path / "run")
+    with Store[Any](tmp_path / "run", write=False) as store:
+        assert store.counts()["asked"] == 0
 
 
 def children(pid: int) -> list[int]:
