@@ -92,8 +92,10 @@ def _collect(
     rows = []
     begins = np.ones(len(observations), bool) if begins is None else begins
     for t in range(steps):
-        # before the step: a segment shows the state in which each action was taken
-        states, legal = envs.states(), envs.legal()
+        # Before the step: a segment shows the state in which each action was taken. A copy: some simulators go on
+        # writing into the array that they gave out.
+        now, legal = envs.states(), envs.legal()
+        states = None if now is None else now.copy()
         choices, actions = act(observations, legal, begins)
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0][0])
@@ -102,8 +104,7 @@ def _collect(
                 f"{observations[env]}; the policy's weights are no longer finite"
             )
         step = envs.step(actions)
-        # A copy: some simulators go on writing into the array that they gave out.
-        rows.append((observations, choices, actions, step, None if states is None else states.copy(), legal))
+        rows.append((observations, choices, actions, step, states, legal))
         # The final ones: a reset in the same step would hide a simulation that went to infinity.
         if not np.isfinite(step.final_observations).all():
             raise FloatingPointError(_not_finite(step.final_observations, actions, t))

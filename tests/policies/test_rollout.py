@@ -109,3 +109,10 @@ def test_a_reward_that_looks_back_is_told_where_episodes_begin() -> None:
 
     learned_rewards(Told(), rollout)  # type: ignore[arg-type]
     assert np.flatnonzero(told[0][0]).tolist() == [0, 7, 14]
+
+
+def test_states_are_those_in_which_actions_were_taken_also_where_a_simulator_writes_on() -> None:
+    envs = _task(env="InvertedPendulum-v5").environments(2)
+    rollout, _ = collect(envs, envs.reset(np.random.default_rng(0)), 9, _act)
+    assert rollout.states is not None
+    np.testing.assert_array_equal(rollout.states.astype(np.float32), rollout.observations)
