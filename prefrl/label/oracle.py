@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
+from prefrl.envs.heights import HEIGHTS
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
-from prefrl.kinds import named
+from prefrl.kinds import named, only
 from prefrl.label import teachers
 from prefrl.label.teachers import Limits, Survey
 from prefrl.protocols import Store, Task
 from prefrl.seeding import draw_seed, keyed
-from prefrl.types import C, Floats, Query
+from prefrl.types import C, Floats, Query, Segment
 
 ONE_OF = (
     ["rationality", "error_rate"],
@@ -26,6 +27,8 @@ ONE_OF = (
 """Ways of saying the same thing."""
 RELATIVE = ("error_rate", "skip_rate", "tie_rate", "skip_epsilon", "tie_epsilon", "length_bias")
 """Settings that are measured against the gold of what has been asked."""
+Measure: TypeAlias = Callable[[Floats], Floats]
+"""Simulator states (T, S) -> what a teacher sees of each step, (T,)."""
 
 
 class OracleSettings(Settings):
@@ -36,6 +39,9 @@ class OracleSettings(Settings):
     """Who answers; kept with every answer."""
     judgement: Literal["ranking", "choice", "rating"] = "ranking"
     """What is said of K candidates: their order (two: a comparison), the best one, or a level for each."""
+    sees: Literal["gold", "height"] = "gold"
+    """What it goes by: gold, or how high the tip of an acrobot or a mountain car stands, on average over a segment, for
+    want of any gold before the goal is reached. Gold stays the environment's own."""
     scale: int = Field(5, ge=2)
     """Levels of a rating; each is given to an equal share of all candidates asked about so far."""
     rationality: float | None = Field(None, gt=0)
@@ -73,6 +79,10 @@ class OracleSettings(Settings):
                 raise ValueError(f"give one of {' and '.join(given)}: both say the same thing")
         if self.bpref_compat and not (self.skip_epsilon or self.tie_epsilon):
             raise ValueError("bpref_compat changes skip_epsilon and tie_epsilon only: give one of them")
+        if self.sees != "gold" and (self.skip_epsilon or self.tie_epsilon):
+            raise ValueError(
+                f"skip_epsilon and tie_epsilon are shares of gold, and sees={self.sees}: use skip_rate and tie_rate"
+            )
         if self.judgement == "rating" and self.position_bias:
             raise ValueError("position_bias changes an order, and a rating has none: leave it at 0")
         return self
@@ -93,7 +103,18 @@ class OracleSettings(Settings):
             raise ConfigError(
                 f"labeler.length_bias: only texts differ in length; expected 0 for a task of kind {task.kind!r}"
             )
-        return Oracle(self)
+        return Oracle(self, self._measure(task))
+
+    def _measure(self, task: Task) -> Measure | None:
+        """Of what is seen in the place of gold."""
+        if self.sees == "gold":
+            return None
+        if task.name not in HEIGHTS:
+            raise ConfigError(
+                f"labeler.sees={self.sees}: expected a task whose heights are known ({', '.join(HEIGHTS)}), got "
+                f"{task.name}; use sees=gold"
+            )
+        return HEIGHTS[task.name]
 
 
 @dataclass(frozen=True)
@@ -101,6 +122,8 @@ class Oracle:
     """Answers every open query at once (B-Pref's simulated teachers: Lee et al. 2021, section 4.2)."""
 
     settings: OracleSettings
+    measure: Measure | None = None
+    """What it goes by in the place of gold."""
 
     @property
     def name(self) -> str:
@@ -168,9 +191,13 @@ class Oracle:
         return replace(found, rationality=beta, cuts=tuple(cuts.tolist()))
 
     def see(self, query: Query[C], gold: Sequence[Floats], limits: Limits) -> Floats:
-        """(K,) what each candidate seems to be worth: its gold, discounted, plus what its length adds."""
+        """(K,) what each candidate seems to be worth: its gold, discounted, plus what its length adds.
+
+        A teacher that does not go by gold has a measure of its own in the place of it.
+        """
+        steps = gold if self.measure is None else [self.measure(states) for states in _states(query)]
         try:
-            seen = teachers.discounted(gold, self.settings.discount)
+            seen = teachers.discounted(steps, self.settings.discount)
         except ValueError as error:
             raise ValueError(f"query {query.id[:12]}: {error}") from None
         return seen + limits.length_price * (teachers.lengths(query) - limits.length_mean)
@@ -211,6 +238,18 @@ class Oracle:
         if len(ranks) > 2:
             return Ranking(query.id, tuple(ranks.tolist()), self.name, shown)
         return Comparison(query.id, 0.5 + 0.5 * float(np.sign(ranks[1] - ranks[0])), self.name, shown)
+
+
+def _states(query: Query[C]) -> list[Floats]:
+    """The simulator states of each candidate. Raises `ValueError` where one has none."""
+    error = ValueError(
+        f"query {query.id[:12]} has candidates without simulator states, from which labeler.sees measures; leave "
+        "task.after_end and task.options as they are, or use sees=gold"
+    )
+    found = [segment.states for segment in only(Segment, query.candidates, error)]
+    if any(states is None for states in found):
+        raise error
+    return [states for states in found if states is not None]
 
 
 def _unskipped(seen: list[Floats], skip_below: float) -> list[Floats]:

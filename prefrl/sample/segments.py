@@ -21,7 +21,9 @@ def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
     """Where segments of `length` steps may start, as (W, 2) pairs (environment, step), and a weight (W,) for each.
 
     A window lies inside one episode; the last start is included. The first and last window of an episode weigh as
-    much as `length` others: its edges would else be seen `length` times less often than its middle.
+    much as `length` others: its edges would else be seen `length` times less often than its middle. Windows in which
+    nothing is seen to move are all alike, and those of one episode together weigh as much as one: else the rest that
+    follows an early end would be most of what is asked about.
     """
     ends, begins = rollout.ends, rollout.begins
     episode = begins.cumsum(1)  # (n, T): steps of one episode have one number
@@ -32,7 +34,21 @@ def windows(rollout: Rollout, length: int) -> tuple[np.ndarray, Floats]:
     starts = np.argwhere(inside)
     env, t = starts.T
     at_edge = begins[env, t] | ends[env, t + length - 1]
-    return starts, np.where(at_edge, float(length), 1.0)
+    weights = np.where(at_edge, float(length), 1.0)
+    at_rest = _at_rest(rollout.observations, length)[env, t]
+    _, which, counts = np.unique(
+        np.stack([env, episode[env, t]], 1)[at_rest], axis=0, return_inverse=True, return_counts=True
+    )
+    weights[at_rest] = 1.0 / counts[which]
+    return starts, weights
+
+
+def _at_rest(observations: Floats, length: int) -> np.ndarray:
+    """(n, W): whether all observations of the window that starts there are the same; never where it is one step."""
+    moves = (observations[:, 1:] != observations[:, :-1]).any(-1)  # (n, T - 1)
+    moved = np.pad(moves.cumsum(1), ((0, 0), (1, 0)))  # (n, T): how often until there
+    found: np.ndarray = moved[:, length - 1 :] == moved[:, : moved.shape[1] - length + 1]
+    return found & (length > 1)
 
 
 def cut(rollout: Rollout, length: int, count: int, name: str, rng: np.random.Generator) -> list[Segment]:

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from pydantic import ValidationError
 
 from prefrl import Config
 from prefrl.components import ConfigError
+from prefrl.envs.control import ControlSettings
 from prefrl.envs.toys import PointSettings
 from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip
 from prefrl.label.crowd import Crowd, CrowdSettings
@@ -74,6 +76,24 @@ def test_a_myopic_teacher_looks_at_late_steps(make_segment: Callable[..., Segmen
         judged = judge(query, rng, discount=discount)
         assert isinstance(judged, Comparison)
         assert query.candidates[int(judged.preference == 0.0)] is winner
+
+
+def test_a_teacher_that_sees_height_prefers_what_swings_higher_and_needs_no_gold(rng: np.random.Generator) -> None:
+    task = ControlSettings(env="Acrobot-v1").build()
+    oracle, hanging = OracleSettings(sees="height").build(task), np.zeros((5, 4))
+    raised = hanging + np.array([1.0, 0.5, 0.0, 0.0])
+    low, high = (
+        Segment(np.zeros((5, 6), np.float32), np.zeros((5, 3), np.float32), name, 0, states)
+        for name, states in (("low", hanging), ("high", raised))
+    )
+    nothing = [np.full(5, np.nan)] * 2
+    for query in (Query((low, high)), Query((high, low))):
+        judged = oracle.judge(query, nothing, rng, oracle.limits(None))
+        assert isinstance(judged, Comparison)
+        assert query.candidates[int(judged.preference == 0.0)] is high
+    blind = Query((low, replace(high, states=None)))
+    with pytest.raises(ValueError, match="without simulator states"):
+        oracle.judge(blind, nothing, rng, oracle.limits(None))
 
 
 def two_arrays(segment: Segment) -> tuple[Any, Any]:
@@ -221,6 +241,7 @@ def test_one_candidate_can_only_be_rated(make_query: Ask, rng: np.random.Generat
         ({"tie_within": 1.0, "tie_epsilon": 0.1}, "tie_within and tie_epsilon"),
         ({"bpref_compat": True}, "skip_epsilon and tie_epsilon"),
         ({"judgement": "rating", "position_bias": 0.1}, "a rating has none"),
+        ({"sees": "height", "tie_epsilon": 0.1}, "shares of gold"),
         ({"error_rate": 0.6}, "less than or equal to 0.49"),
     ],
 )
@@ -235,6 +256,8 @@ def test_settings_that_do_not_suit_the_task_are_refused() -> None:
         OracleSettings(discount=0.9).build(task)
     with pytest.raises(ConfigError, match="only texts differ in length"):
         OracleSettings(length_bias=0.1).build(PointSettings().build())
+    with pytest.raises(ConfigError, match=r"labeler.sees=height: expected a task whose heights are known \(Acrobot-v1"):
+        OracleSettings(sees="height").build(PointSettings().build())
 
 
 RATES = {"a": 0.0, "b": 0.0, "c": 1.0}

@@ -36,6 +36,11 @@ def _alternating() -> Act:
     return act
 
 
+def _one_way(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
+    actions = np.tile(np.array([0, 1], np.float32), (len(observations), 1))
+    return actions, actions
+
+
 def _rollout(steps: int = 17, count: int = 2) -> Rollout:
     envs = _task().environments(count)
     return collect(envs, envs.reset(np.random.default_rng(0)), steps, _act)[0]
@@ -50,6 +55,19 @@ def test_windows_stay_inside_one_episode_and_include_the_last_start() -> None:
         *(3, 1, 1, 1, 3),
         3,
     ]
+
+
+def test_windows_in_which_nothing_moves_weigh_together_as_much_as_one() -> None:
+    envs = _task(env="CartPole-v1", horizon=40, segment_steps=5).environments(3)
+    rollout = collect(envs, envs.reset(np.random.default_rng(0)), 80, _one_way)[0]
+    starts, weights = windows(rollout, 5)
+    still = np.array([(rollout.observations[i, t : t + 5] == rollout.observations[i, t]).all() for i, t in starts])
+    assert still.sum() > 0.6 * len(starts)  # a pole that is pushed one way falls within ten steps
+    for env in range(3):
+        for episode in (0, 1):
+            mine = (starts[:, 0] == env) & (starts[:, 1] // 40 == episode)
+            assert weights[mine & still].sum() == pytest.approx(1.0)
+            assert set(weights[mine & ~still]) == {1.0, 5.0}
 
 
 def test_every_window_is_cut_at_most_once_and_all_can_be() -> None:
