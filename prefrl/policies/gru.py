@@ -19,7 +19,7 @@ from torch import Tensor
 
 from prefrl.components import Settings
 from prefrl.policies.acting import Decide, Memory, Reading, copy_into, in_chunks, on_device
-from prefrl.policies.heads import ActionSpace, choose, density, starting_std
+from prefrl.policies.heads import ActionSpace, InitialStd, choose, density, starting_std
 from prefrl.policies.normaliser import Normaliser
 from prefrl.policies.recurrence import recurrence, unit
 from prefrl.policies.rollout import Rollout
@@ -42,8 +42,7 @@ class GRUPolicySettings(Settings):
     """Units of the layer behind it."""
     chunk: int = Field(32, ge=2)
     """Steps through which the update goes back; what has to be remembered should fit into them."""
-    initial_std: float = Field(1.0, gt=0)
-    """Of the actions' noise at the start, in units of half the action bounds."""
+    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> GRUPolicy:
         return GRUPolicy(self, task, rng)
@@ -82,16 +81,15 @@ class GRUPolicy:
         self.chunk, self.space = settings.chunk, ActionSpace.of(task)
         self._width = settings.width
         named = _weights(settings, task, generator(rng)) | starting_std(self.space, settings.initial_std)
-        self._p = {name: torch.nn.Parameter(p) for name, p in named.items()}
+        self._p = torch.nn.ParameterDict(named.items())  # pairs: of a mapping it would not keep the order
         self.normaliser = Normaliser(task.observation_size)
 
     @property
     def device(self) -> torch.device:
-        return self._p["state_weight"].device
+        return next(iter(self.parameters())).device
 
     def to(self, device: torch.device) -> None:
-        for parameter in self._p.values():
-            parameter.data = parameter.data.to(device)
+        self._p.to(device)
 
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return self._p.values()
@@ -159,12 +157,12 @@ class GRUPolicy:
         return {"parameters": {name: p.detach().clone() for name, p in self._p.items()}} | self.normaliser.state()
 
     def load(self, state: State) -> None:
-        copy_into(dict(self._p), state["parameters"])
+        copy_into(self.named(), state["parameters"])
         self.normaliser.load(state)
 
     def named(self) -> dict[str, Tensor]:
         """Every weight by its name."""
-        return dict(self._p)
+        return dict(self._p.items())
 
     def _states(self, observations: Tensor, begins: Tensor, start: Tensor, nets: slice) -> Tensor:
         """(B, L, O) normalised, (B, L) and (B, E, H) of the E networks in `nets` -> (E, L, B, H) after each step."""
@@ -179,11 +177,13 @@ class GRUPolicy:
 
     def _said(self, states: Tensor, net: int) -> Tensor:
         """(L, B, H) -> (L, B, hidden)."""
-        return torch.tanh(states @ self._p["hidden_weight"][net] + self._p["hidden_bias"][net])
+        weight, bias = self._p["hidden_weight"][net], self._p["hidden_bias"][net]
+        return torch.tanh(states @ weight + bias)
 
     def _values(self, states: Tensor) -> Tensor:
         """(L, B, H) of the critic -> (L, B)."""
-        return (self._said(states, 1) @ self._p["critic_weight"] + self._p["critic_bias"]).squeeze(-1)
+        found: Tensor = self._said(states, 1) @ self._p["critic_weight"] + self._p["critic_bias"]
+        return found.squeeze(-1)
 
     def _density(self, states: Tensor, inputs: Chunks) -> tuple[Tensor, Tensor]:
         """(L, B, H) of the actor -> (B, L) log-probabilities and entropies."""
