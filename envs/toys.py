@@ -71,7 +71,8 @@ class TMaze:
         taken = np.where(turns, np.where(move == 1, -1.0, 1.0), arm)
         following = np.stack([place + (on & ~junction), side, taken, age + 1], 1)
         idle = np.where(junction, on & (arm == 0), ~on)
-        return following, 1.0 * (turns & (taken == side)) - idle / self.length, np.zeros(len(states), bool)
+        # An end, not a time limit: what follows the last step looks like the junction, and a critic would value it so.
+        return following, 1.0 * (turns & (taken == side)) - idle / self.length, age + 1 >= self.length
 
     def observe(self, states: Floats) -> Floats:
         """(n, 2): the sign, -1 or 1, at the first step and 0 later; and whether this is the junction."""
