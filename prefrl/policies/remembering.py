@@ -88,7 +88,7 @@ class RememberingPolicy:
         and of the heads on their features."""
         self.chunk, self.space = chunk, ActionSpace.of(task)
         self._networks, self._p = networks, p
-        self.normaliser = Normaliser(task.observation_size)
+        self.normaliser = Normaliser(task.observation_size, calm=True)
 
     @property
     def device(self) -> torch.device:

@@ -11,6 +11,7 @@ from prefrl.improve.control import ControlLearnerSettings
 from prefrl.policies.acting import Acting, forgotten, in_chunks
 from prefrl.policies.heads import density
 from prefrl.policies.loaded import Loaded
+from prefrl.policies.normaliser import CLIP, Normaliser
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -85,6 +86,27 @@ def test_new_statistics_do_not_change_what_the_policy_does(kind: str) -> None:
         assert one is not None
         assert other is not None
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+def test_an_input_that_never_changed_is_not_blown_up_and_what_follows_it_stays_the_same() -> None:
+    """Of such an input a critic knows nothing; each new share of it is folded into the first layers."""
+    calm, plain = Normaliser(1, calm=True), Normaliser(1)
+    never, seldom = np.zeros((100, 1)), np.eye(1, 100).T
+    for one in (calm, plain):
+        one.observe(never)
+    seen = np.ones((1, 1), np.float32)
+    assert [float(one.now()(seen)[0, 0]) for one in (calm, plain)] == [1.0, CLIP]
+    move = calm.observe(seldom)
+    assert move is not None
+    assert float((calm.now()(seen) * move.ratio + move.shift)[0, 0]) == pytest.approx(
+        min(1.0, CLIP / calm.scale[0]), abs=0.01
+    )
+    for _ in range(5):
+        before = calm.now()(seen) if calm.scale[0] < CLIP else None
+        move = calm.observe(np.repeat([[0.0], [1.0]], 40, 0))
+        assert move is not None
+        if before is not None:
+            np.testing.assert_allclose(calm.now()(seen) * move.ratio + move.shift, before, atol=1e-5)
 
 
 def test_rows_are_cut_from_their_start_and_padded_at_their_end() -> None:
