@@ -3,9 +3,9 @@
     python benchmarks/control_memory.py [--kinds gru transformer mlp] [--seeds 5] [--first 100]
 
 A sign at the start says which arm at the end is right. Who remembers it gets 1, who does not 0.5 on average. All kinds
-learn with the same settings, but for the learning rate, from as many steps; afterwards 200 episodes of the policy's mode
-are scored. `ours` is the lowest of the means of the kinds with a memory, `peer` that of mlp; the last line is one JSON
-object.
+learn from as many steps with the same settings, but for the learning rate; afterwards 200 episodes of the policy's
+mode are scored. `ours` is the lowest of the means of the kinds with a memory, `peer` that of mlp; the last line is one
+JSON object.
 """
 
 from __future__ import annotations
