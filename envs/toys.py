@@ -71,7 +71,8 @@ class TMaze:
         taken = np.where(turns, np.where(move == 1, -1.0, 1.0), arm)
         following = np.stack([place + (on & ~junction), side, taken, age + 1], 1)
         idle = np.where(junction, on & (arm == 0), ~on)
-        return following, 1.0 * (turns & (taken == side)) - idle / self.length, np.zeros(len(states), bool)
+        # An end, not a time limit: what follows the last step looks like the junction, and a critic would value it so.
+        return following, 1.0 * (turns & (taken == side)) - idle / self.length, age + 1 >= self.length
 
     def observe(self, states: Floats) -> Floats:
         """(n, 2): the sign, -1 or 1, at the first step and 0 later; and whether this is the junction."""
@@ -106,33 +107,9 @@ class TMazeSettings(Settings):
     frame_size: int = Field(120, ge=16, le=2048)
     """Height and width of drawn frames, in pixels."""
 
-    def build(self) -> TMazeTask:
+    def build(self) -> ToyTask:
         steps = self.segment_steps or self.length
-        if steps > self.length:
-            raise ConfigError(f"task: a segment of {steps} steps is longer than an episode of {self.length}")
-        return TMazeTask(self.length, steps, self.frame_size)
-
-
-@dataclass(frozen=True)
-class TMazeTask:
-    """A `prefrl.protocols.ControlTask`."""
-
-    horizon: int
-    segment_steps: int
-    frame_size: int
-    name: str = "tmaze"
-    kind: str = "control"
-    observation_size: int = 2
-    action_size: int = 3
-    action_bounds: None = None
-    fps: float = 5.0
-
-    def environments(self, count: int) -> Environments:
-        return Vectorised(TMaze(self.horizon), count, self.horizon)
-
-    def frames(self, segment: Segment) -> np.ndarray:
-        """(T, frame_size, frame_size, 3). Raises `ValueError` where the segment keeps no states."""
-        return _drawn(TMaze(self.horizon), segment, self.frame_size)
+        return ToyTask("tmaze", TMaze(self.length), self.length, steps, self.frame_size, action_size=3, fps=5.0)
 
 
 class PointSettings(Settings):
@@ -146,40 +123,41 @@ class PointSettings(Settings):
     frame_size: int = Field(120, ge=16, le=2048)
     """Height and width of drawn frames, in pixels."""
 
-    def build(self) -> PointTask:
+    def build(self) -> ToyTask:
+        bounds = -np.ones(2, np.float32), np.ones(2, np.float32)
+        parts = "point", Point(), self.horizon, self.segment_steps, self.frame_size
+        return ToyTask(*parts, action_size=2, fps=10.0, action_bounds=bounds)
+
+
+@dataclass(frozen=True, eq=False)
+class ToyTask:
+    """A `prefrl.protocols.ControlTask` of a world in this file.
+
+    Raises `ConfigError` for segments that are longer than an episode.
+    """
+
+    name: str
+    world: Point | TMaze
+    horizon: int
+    segment_steps: int
+    frame_size: int
+    action_size: int
+    fps: float
+    action_bounds: tuple[Floats, Floats] | None = None
+    observation_size: int = 2
+    kind: str = "control"
+
+    def __post_init__(self) -> None:
         if self.segment_steps > self.horizon:
             raise ConfigError(
                 f"task: a segment of {self.segment_steps} steps is longer than an episode of {self.horizon}"
             )
-        return PointTask(self.horizon, self.segment_steps, self.frame_size)
-
-
-@dataclass(frozen=True)
-class PointTask:
-    """A `prefrl.protocols.ControlTask`."""
-
-    horizon: int
-    segment_steps: int
-    frame_size: int
-    name: str = "point"
-    kind: str = "control"
-    observation_size: int = 2
-    action_size: int = 2
-    fps: float = 10.0
-
-    @property
-    def action_bounds(self) -> tuple[Floats, Floats]:
-        return -np.ones(2, np.float32), np.ones(2, np.float32)
 
     def environments(self, count: int) -> Environments:
-        return Vectorised(Point(), count, self.horizon)
+        return Vectorised(self.world, count, self.horizon)
 
     def frames(self, segment: Segment) -> np.ndarray:
         """(T, frame_size, frame_size, 3). Raises `ValueError` where the segment keeps no states."""
-        return _drawn(Point(), segment, self.frame_size)
-
-
-def _drawn(world: Point | TMaze, segment: Segment, size: int) -> np.ndarray:
-    if segment.states is None:
-        raise ValueError("a segment can only be drawn from its simulator states, and this one has none")
-    return np.stack([world.picture(state, size) for state in segment.states])
+        if segment.states is None:
+            raise ValueError("a segment can only be drawn from its simulator states, and this one has none")
+        return np.stack([self.world.picture(state, self.frame_size) for state in segment.states])

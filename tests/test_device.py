@@ -100,6 +100,7 @@ POLICIES: list[dict[str, Any]] = [
     {"kind": "mlp", "hidden": (8,)},
     {"kind": "cnn", "image": (1, 2, 1), "filters": [(4, 1, 1)], "width": 8},
     {"kind": "gru", "width": 6, "hidden": 5, "chunk": 3},
+    {"kind": "transformer", "context": 3, "width": 6, "heads": 2, "hidden": 5, "chunk": 3},
 ]
 
 

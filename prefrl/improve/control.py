@@ -34,6 +34,7 @@ from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, step_rewards
+from prefrl.policies.transformer import TransformerPolicySettings
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, to_host
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
@@ -59,7 +60,7 @@ def _of_some_kind(given: Any) -> Any:
 
 
 PolicySettings: TypeAlias = Annotated[
-    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings,
+    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings | TransformerPolicySettings,
     Field(discriminator="kind"),
     BeforeValidator(_of_some_kind),
 ]

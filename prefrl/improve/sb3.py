@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, JsonValue
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -27,14 +27,14 @@ from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
 from prefrl.improve.replay import cut, load_replay, relabel, replay_state
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
-from prefrl.policies.acting import Memory
+from prefrl.policies.acting import Acting, Memory
 from prefrl.policies.loaded import Actor
 from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
-Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN", "QRDQN"]
+Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "RecurrentPPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN", "QRDQN"]
 
 
 class Algorithm(NamedTuple):
@@ -50,6 +50,8 @@ class Algorithm(NamedTuple):
     """The default `batch_size` of one that learns from rollouts."""
     draws: bool = True
     """Whether its policy draws actions. Where it does not, first questions are about random actions."""
+    policy: str = "MlpPolicy"
+    """Which of its policies."""
 
     @property
     def explores(self) -> bool:
@@ -61,6 +63,7 @@ ALGORITHMS: dict[Name, Algorithm] = {
     "PPO": Algorithm("stable_baselines3", 2048, replays=False, actions="any", batch=64),
     "A2C": Algorithm("stable_baselines3", 5, replays=False, actions="any"),
     "TRPO": Algorithm("sb3_contrib", 2048, replays=False, actions="any", batch=128),
+    "RecurrentPPO": Algorithm("sb3_contrib", 128, replays=False, actions="any", batch=128, policy="MlpLstmPolicy"),
     "SAC": Algorithm("stable_baselines3", 1),
     "TD3": Algorithm("stable_baselines3", 1, draws=False),
     "DDPG": Algorithm("stable_baselines3", 1, draws=False),
@@ -83,7 +86,7 @@ class SB3Settings(Settings):
     kind: Literal["sb3"] = "sb3"
     algorithm: Name = "PPO"
     """Which one; DQN and QRDQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the others for
-    both."""
+    both. RecurrentPPO remembers."""
     environments: int = Field(8, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)
@@ -104,17 +107,6 @@ class SB3Settings(Settings):
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     threads: int | None = Field(1, ge=1)
     """With how many threads torch and BLAS compute: more make small networks slower; null leaves it to them."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known(cls, given: Any) -> Any:
-        if isinstance(given, dict) and given.get("algorithm") == "RecurrentPPO":
-            raise ValueError(
-                "algorithm=RecurrentPPO is not supported: its memory goes from step to step, and evaluations, "
-                "load_policy and segments of other policies here act on one observation at a time; show a policy "
-                "without memory the last few at once with task.stack=4"
-            )
-        return given
 
     def shrunk(self) -> SB3Settings:
         """One rollout of a batch in each environment; with a replay buffer about as many, learning from the first."""
@@ -254,8 +246,7 @@ class SB3:
 
     def actor(self) -> Actor:
         def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
-            fresh = np.zeros(len(observations), bool)
-            return self._act(deterministic=rng is None)(observations, None, fresh)[1], memory
+            return self._chosen(observations, memory, deterministic=rng is None)
 
         return act
 
@@ -334,12 +325,25 @@ class SB3:
         return act
 
     def _act(self, deterministic: bool) -> Act:
-        def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
-            chosen, _ = self.model.predict(observations, deterministic=deterministic)
-            actions = executed(self._env.action_space, chosen)
-            return actions, actions
+        """In episodes that are yet to begin."""
 
-        return act
+        def decide(
+            observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
+        ) -> tuple[Floats, Floats, Memory]:
+            actions, memory = self._chosen(observations, memory, deterministic)
+            return actions, actions, memory
+
+        return Acting(decide, None)
+
+    def _chosen(self, observations: Floats, memory: Memory, deterministic: bool) -> tuple[Floats, Memory]:
+        """(n, O) and (n, M) -> (n, A) actions to execute, and what is remembered now, if anything."""
+        state, count = None, len(observations)
+        if memory is not None:
+            layers = self.model.policy.lstm_actor.num_layers
+            state = tuple(memory.reshape(count, 2, layers, -1).transpose(1, 2, 0, 3))  # 2 x (layers, n, H)
+        chosen, state = self.model.predict(observations, state, deterministic=deterministic)
+        after = None if state is None else np.stack(state).transpose(2, 0, 1, 3).reshape(count, -1)
+        return executed(self._env.action_space, chosen), after
 
 
 @contextmanager
@@ -374,8 +378,9 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
         options.setdefault("n_steps", settings.at_once)
     try:
         device = device_of(settings.device)
+        network, kwargs = ALGORITHMS[settings.algorithm].policy, dict(settings.policy) or None
         return algorithm_class(settings.algorithm)(
-            "MlpPolicy", env, policy_kwargs=dict(settings.policy) or None, device=device, verbose=0, **options
+            network, env, policy_kwargs=kwargs, device=device, verbose=0, **options
         )
     except TypeError as error:  # an option that its constructor does not have
         raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error

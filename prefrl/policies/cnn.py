@@ -19,7 +19,7 @@ from torch.nn.functional import conv2d, linear
 
 from prefrl.components import ConfigError, Settings
 from prefrl.policies.acting import Decide, Decisions, Memory, Reading, copy_into
-from prefrl.policies.heads import ActionSpace, choose, density, starting_std
+from prefrl.policies.heads import ActionSpace, InitialStd, choose, density, starting_std
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask
 from prefrl.seeding import generator, to_numpy
@@ -45,8 +45,7 @@ class CNNPolicySettings(Settings):
     """Units of the layer behind the convolutions."""
     brightest: float = Field(255.0, gt=0)
     """Pictures are divided by this."""
-    initial_std: float = Field(1.0, gt=0)
-    """Of the actions' noise at the start, in units of half the action bounds."""
+    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> CNNPolicy:
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
@@ -81,15 +80,14 @@ class CNNPolicy:
             )
         named = _weights(settings, self._frames, task.action_size, generator(rng))
         named |= starting_std(self.space, settings.initial_std)
-        self._p = {name: torch.nn.Parameter(p) for name, p in named.items()}
+        self._p = torch.nn.ParameterDict(named.items())  # pairs: of a mapping it would not keep the order
 
     @property
     def device(self) -> torch.device:
-        return self._p["width_weight"].device
+        return next(iter(self.parameters())).device
 
     def to(self, device: torch.device) -> None:
-        for parameter in self._p.values():
-            parameter.data = parameter.data.to(device)
+        self._p.to(device)
 
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return self._p.values()
@@ -131,11 +129,11 @@ class CNNPolicy:
         return {"parameters": {name: p.detach().clone() for name, p in self._p.items()}}
 
     def load(self, state: State) -> None:
-        copy_into(dict(self._p), state["parameters"])
+        copy_into(self.named(), state["parameters"])
 
     def named(self) -> dict[str, Tensor]:
         """Every weight by its name."""
-        return dict(self._p)
+        return dict(self._p.items())
 
     def _features(self, pixels: Tensor) -> Tensor:
         """(B, frames x height x width x channels) -> (B, width)."""

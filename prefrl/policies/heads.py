@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from prefrl.protocols import ControlTask
@@ -21,6 +22,10 @@ ILLEGAL = -1e9
 """The logit of an action that is not legal (Huang and Ontanon 2022, section 3): its probability is 0, and 0 times its
 logarithm is 0 as well, where minus infinity would make NaN of it."""
 
+InitialStd: TypeAlias = Annotated[
+    float, Field(gt=0, description="Of the actions' noise at the start, in units of half the action bounds.")
+]
+"""A setting of every kind of policy."""
 Slopes: TypeAlias = tuple[Floats, Floats | None]
 """The gradients of the outputs (B, A), and of the log standard deviations (A,) where there are any."""
 
@@ -193,4 +198,14 @@ class Categorical:
         return found, None
 
 
-__all__ = ["ILLEGAL", "ActionSpace", "Categorical", "Gaussian", "Slopes", "choose", "density", "starting_std"]
+__all__ = [
+    "ILLEGAL",
+    "ActionSpace",
+    "Categorical",
+    "Gaussian",
+    "InitialStd",
+    "Slopes",
+    "choose",
+    "density",
+    "starting_std",
+]

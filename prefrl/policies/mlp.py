@@ -16,7 +16,7 @@ from torch import Tensor
 
 from prefrl.components import Settings
 from prefrl.policies.acting import Decide, Decisions, Memory, Reading, copy_into
-from prefrl.policies.heads import ActionSpace, Categorical, Gaussian, choose, density, starting_std
+from prefrl.policies.heads import ActionSpace, Categorical, Gaussian, InitialStd, choose, density, starting_std
 from prefrl.policies.normaliser import Normaliser, Scaling
 from prefrl.policies.perceptron import Activation, Layers, activated, backward, forward
 from prefrl.policies.rollout import Rollout
@@ -35,8 +35,7 @@ class MLPPolicySettings(Settings):
     """Widths of the critic's hidden layers; null for those of the actor."""
     activation: Activation = "tanh"
     """What follows each hidden layer."""
-    initial_std: float = Field(1.0, gt=0)
-    """Of the actions' noise at the start, in units of half the action bounds."""
+    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> MLPPolicy:
         return MLPPolicy(self, task, rng)

@@ -13,6 +13,8 @@ from prefrl.types import Floats, State
 
 STEADY = 2.0
 """By how much the scale of an input may change at once for the first layers to follow it."""
+STILL = 1e-8
+"""The variance of an input that does not change."""
 CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations."""
 
@@ -52,7 +54,10 @@ class Move(NamedTuple):
 class Normaliser:
     """The mean and the variance of all observations so far; before the first ones, 0 and 1."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, calm: bool = False) -> None:
+        """`calm`: an input that never changed keeps its scale, and is not blown up where it changes for the first time,
+        in a state where the critic knows nothing: its guess would then outweigh every return."""
+        self.calm = calm
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
         self.raw = False
         """Whether observations are seen as they are, for good: by a policy that learned without a normaliser."""
@@ -60,7 +65,7 @@ class Normaliser:
     @property
     def scale(self) -> Floats:
         found: Floats = 1.0 / np.sqrt(self.variance + 1e-8)  # eps: some inputs never change
-        return found
+        return np.where(self.variance > STILL, found, 1.0) if self.calm else found
 
     def now(self) -> Scaling:
         mean, scale = self.mean.astype(np.float32), self.scale.astype(np.float32)
@@ -98,7 +103,7 @@ class Normaliser:
         """From these statistics (O,) to the present ones."""
         ratio, shift = scale / self.scale, (self.mean - mean) * scale
         # An input that hardly changed before was blown up, and clipped: its weights are not to become as large.
-        steady = (ratio > 1 / STEADY) & (ratio < STEADY)
+        steady = (ratio > (0 if self.calm else 1 / STEADY)) & (ratio < STEADY)
         return Move(np.where(steady, ratio, 1.0), np.where(steady, shift, 0.0))
 
 

@@ -23,6 +23,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "mlp": {"hidden": (6,), "critic_hidden": (7, 5), "activation": "relu"},
     "cnn": {"kind": "cnn", "image": (1, 1, 1), "filters": [[4, 1, 1]], "width": 8},
     "gru": {"kind": "gru", "width": 6, "hidden": 5, "chunk": 8},
+    "transformer": {"kind": "transformer", "context": 5, "width": 6, "heads": 2, "hidden": 5, "chunk": 8},
 }
 
 

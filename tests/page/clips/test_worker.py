@@ -15,7 +15,7 @@ import pytest
 
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.render import graphics
-from prefrl.envs.toys import PointTask
+from prefrl.envs.toys import ToyTask
 from prefrl.page.clips.encode import formats
 from prefrl.page.clips.worker import Artist, JobError, _lasting, _sentence
 from prefrl.storage.engines import StoreError
@@ -26,7 +26,7 @@ CONFIG = "task:\n  kind: point\n  segment_steps: 5\n  frame_size: 33\n"
 IMPORTS = """
 import os, sys, time
 from prefrl.page.clips import worker
-from prefrl.envs.toys import PointTask
+from prefrl.envs.toys import ToyTask
 """
 FILE = f"{'ab' * 32}.{formats()[0]}"
 SOON = 40.0
@@ -101,21 +101,19 @@ def test_a_clip_is_drawn_and_the_reply_says_how_large_it_is(folder: Path, start:
 
 def test_what_libraries_print_is_kept_from_the_replies(start: Callable[..., Child]) -> None:
     child = start(
-        "drawn = PointTask.frames\n"
+        "drawn = ToyTask.frames\n"
         "def frames(task, segment):\n"
         "    print('hello'); os.write(1, b'from C\\n'); os.system('echo from a child')\n"
         "    assert sys.stdin.read() == ''\n"
         "    return drawn(task, segment)\n"
-        "PointTask.frames = frames"
+        "ToyTask.frames = frames"
     )
     child.send(point_segment(0).id)
     assert set(child.receive()) == {"file", "bytes"}
 
 
 def test_the_end_of_the_input_ends_it_even_while_it_draws(start: Callable[..., Child]) -> None:
-    child = start(
-        "def frames(task, segment):\n    os.write(2, b'drawing\\n'); time.sleep(60)\nPointTask.frames = frames"
-    )
+    child = start("def frames(task, segment):\n    os.write(2, b'drawing\\n'); time.sleep(60)\nToyTask.frames = frames")
     child.send(point_segment(0).id)
     assert child.process.stdin is not None
     assert child.process.stderr is not None
@@ -126,7 +124,7 @@ def test_the_end_of_the_input_ends_it_even_while_it_draws(start: Callable[..., C
 
 
 def test_a_hang_that_nobody_ends_ends_itself_and_says_where(start: Callable[..., Child]) -> None:
-    child = start("worker.GRACE = 0.1\ndef frames(task, segment):\n    time.sleep(60)\nPointTask.frames = frames")
+    child = start("worker.GRACE = 0.1\ndef frames(task, segment):\n    time.sleep(60)\nToyTask.frames = frames")
     child.send(point_segment(0).id, limit=0.5)
     assert child.process.wait(SOON) == 1
     _, errors = child.process.communicate()
@@ -134,7 +132,7 @@ def test_a_hang_that_nobody_ends_ends_itself_and_says_where(start: Callable[...,
 
 
 def test_an_unforeseen_error_is_one_sentence_for_people_and_a_trace_for_the_log(start: Callable[..., Child]) -> None:
-    child = start("def frames(task, segment):\n    return {}['wheel']\nPointTask.frames = frames")
+    child = start("def frames(task, segment):\n    return {}['wheel']\nToyTask.frames = frames")
     child.send(point_segment(0).id)
     assert child.receive() == {"file": FILE, "error": "KeyError: 'wheel'", "lasting": False}
     _, errors = child.process.communicate(timeout=SOON)
@@ -147,7 +145,7 @@ def test_a_segment_without_states_says_so(folder: Path) -> None:
 
 
 def test_a_task_that_gives_no_frames_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(PointTask, "frames", lambda task, segment: np.zeros((0, 8, 8, 3), np.uint8))
+    monkeypatch.setattr(ToyTask, "frames", lambda task, segment: np.zeros((0, 8, 8, 3), np.uint8))
     with pytest.raises(ValueError, match="nothing to show"):
         Artist(folder).draw(point_segment(0).id, FILE)
 
