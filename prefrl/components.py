@@ -51,6 +51,10 @@ class Settings(BaseModel):
         """Whether a labeler speaks to people, and so needs the terminal for itself."""
         return False
 
+    def asking(self, goal: str) -> Self:
+        """A labeler that asks for this, where its settings ask for nothing themselves."""
+        return self
+
     def formula(self) -> str:
         """What a learner optimises, in plain letters; empty where there is nothing to spell out."""
         return ""

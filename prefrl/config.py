@@ -85,6 +85,8 @@ class Config(Settings):
     """The policy, and how it gets better."""
     loop: LoopSettings = LoopSettings()
     """How often, and how much is asked."""
+    goal: str = Field("", max_length=200)
+    """What is wanted, as a question: people and judges are asked it, unless the labeler has one of its own."""
     seed: int = Field(0, ge=0)
     """All random numbers of the run come from this one."""
 
@@ -166,7 +168,7 @@ class Config(Settings):
         return cast(TaskSettings, self.task).build()
 
     def build_labeler(self, task: Task) -> Labeler:
-        return cast(LabelerSettings, self.labeler).build(task)
+        return cast(LabelerSettings, self.labeler.asking(self.goal)).build(task)
 
     def build_reward(self, task: Task, rng: np.random.Generator) -> RewardModel:
         """Not fitted yet, on the learner's device."""

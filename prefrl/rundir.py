@@ -284,7 +284,8 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
 
 
 def _lasting(config: Config) -> Config:
-    return config.model_copy(update={name: part.lasting() for name, part in config if isinstance(part, Settings)})
+    parts: Json = {name: part.lasting() for name, part in config if isinstance(part, Settings)}
+    return config.model_copy(update=parts | {"goal": ""})
 
 
 def _hash(saved: Path) -> str:

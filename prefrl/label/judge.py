@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from string import Formatter
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -54,7 +54,7 @@ class JudgeSettings(Settings):
     download: bool = False
     """Whether a model that is not on this machine may be downloaded."""
     criterion: str = "Which response is better?"
-    """What is asked of the two responses."""
+    """What is asked of the two responses; the goal of the run where this is left as it is."""
     template: str = TEMPLATE
     """The question, with {prompt}, {first}, {second}, and {criterion} where wanted. {{ and }} are braces."""
     answers: tuple[str, str] = ("A", "B")
@@ -67,6 +67,10 @@ class JudgeSettings(Settings):
     """With text: the most tokens of a reply."""
     batch_size: int = Field(8, ge=1)
     """Questions in one pass."""
+
+    def asking(self, goal: str) -> Self:
+        own = self.criterion != type(self).model_fields["criterion"].default
+        return self if own or not goal else self.model_copy(update={"criterion": goal})
 
     @field_validator("template")
     @classmethod

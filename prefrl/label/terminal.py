@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, Self, cast
 
+import click
 import numpy as np
 from rich.columns import Columns
 from rich.console import Console, Group
@@ -34,9 +36,14 @@ class TerminalSettings(Settings):
     """Who answers; kept with every answer."""
     clips: Path = Path("clips")
     """Where the clips of control queries are written."""
+    question: str = ""
+    """What is asked, in one sentence; the goal of the run where it is left out."""
 
     def asks_people(self) -> bool:
         return True
+
+    def asking(self, goal: str) -> Self:
+        return self if self.question else self.model_copy(update={"question": goal})
 
     def build(self, task: Task) -> Terminal:
         return Terminal(self, task)
@@ -76,6 +83,7 @@ class Terminal:
         """The candidates, numbered as they are shown."""
         candidates = [query.candidates[i] for i in shown]
         kind = kind_of(candidates[0])
+        self.console.print(Text(visible(self.settings.question or kind.question), style="bold cyan"))
         if kind.shows == "clip":
             task = cast(DrawnTask[C], self.task)
             clips = [task.frames(c) for c in candidates]
@@ -95,12 +103,21 @@ class Terminal:
         while True:
             self.console.print(Text(rules, style="dim"))
             try:
-                typed = self.console.input("> ").strip().lower()
+                typed = self._typed(count).strip().lower()
             except EOFError:
                 return "q"
             if understood(typed, count):
                 return typed
             self.console.print(Text(f"{typed!r} is no answer; type one of these:", style="red"))
+
+    def _typed(self, count: int) -> str:
+        """One key where that says it all and somebody sits at a terminal; else a line."""
+        if count > 2 or not sys.stdin.isatty():
+            return self.console.input("> ")
+        self.console.print("> ", end="")
+        key = click.getchar()
+        self.console.print(Text(visible(key)))
+        return key
 
     def _undo(self, store: Store[C], done: list[str]) -> None:
         if not done:

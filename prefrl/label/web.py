@@ -72,7 +72,7 @@ class WebSettings(Settings):
     consent: str = ""
     """What people must agree to before their first question; who agreed to which version, and when, is kept."""
     question: str = ""
-    """What is asked, in one sentence; "Which clip is better?" where it is left out."""
+    """What is asked, in one sentence; the goal of the run where it is left out, or "Which clip is better?"."""
     check_share: float = Field(0.05, ge=0, le=0.5)
     """The share of questions with a clear answer, to find out whether a person looks. Nothing is learned from them."""
     check_warn: float = Field(0.8, ge=0, le=1)
@@ -125,6 +125,9 @@ class WebSettings(Settings):
 
     def asks_people(self) -> bool:
         return True
+
+    def asking(self, goal: str) -> Self:
+        return self if self.question else self.model_copy(update={"question": goal})
 
     def build(self, task: Task) -> WebLabeler:
         return WebLabeler(self, task)

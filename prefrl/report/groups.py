@@ -20,7 +20,7 @@ from prefrl.types import Floats
 
 SHOWN = 3
 """Settings that a group is named by; where more differ it is named by its folder."""
-APART = ("seed", "labeler.port", "labeler.host", "labeler.clips")
+APART = ("seed", "goal", "labeler.port", "labeler.host", "labeler.clips")
 """Settings that may differ within a group."""
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from prefrl import Config
 from prefrl.judgements import Comparison, Ranking, Skip
 from prefrl.label.terminal import Stopped, Terminal, TerminalSettings, interpret, understood
 from prefrl.page.clips.encode import side_by_side, write_clip
@@ -73,6 +74,34 @@ def test_a_sitting_with_every_kind_of_answer(text_store: Store[Response]) -> Non
     assert kinds[1:4] == [0.5, "incomparable", "skip"]
     assert text_store.counts() == {"asked": 5, "answered": 3, "skipped": 2}
     assert all(f"{name} {i}" in seen.getvalue() for name in "ab" for i in range(5))
+
+
+def test_at_a_terminal_one_key_is_an_answer(text_store: Store[Response], monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = iter("1z2q")
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("click.getchar", lambda: next(keys))
+    labeler, seen = person()
+    text_store.ask(queries("a", "b", count=3))
+    with pytest.raises(Stopped):
+        labeler.answer(text_store, np.random.default_rng(0))
+    assert text_store.counts()["answered"] == 2
+    assert "'z' is no answer" in seen.getvalue()
+
+
+def test_the_goal_of_a_run_is_asked_by_whoever_asks_nothing_else() -> None:
+    def asked(*changes: str) -> str:
+        config = Config.load("text/toy", ["goal=Is it kind?", *changes])
+        settings: Any = config.labeler.asking(config.goal)
+        return str(settings.criterion if changes[0].endswith("judge") else settings.question)
+
+    for kind in ("terminal", "web", "judge"):
+        own = "labeler.criterion=Own?" if kind == "judge" else "labeler.question=Own?"
+        assert asked(f"labeler.kind={kind}") == "Is it kind?"
+        assert asked(f"labeler.kind={kind}", own) == "Own?"
+    labeler, seen = person("q")
+    labeler.settings = labeler.settings.asking("Is it kind?")
+    labeler._show(queries("a", "b")[0], [0, 1])
+    assert "Is it kind?" in seen.getvalue()
 
 
 def test_undo_takes_the_last_answer_back_and_asks_again(text_store: Store[Response]) -> None:
