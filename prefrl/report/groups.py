@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import mean
@@ -52,7 +52,6 @@ class Group:
 
     name: str
     runs: tuple[Seen, ...]
-    rng_seed: int = field(default=0, repr=False)
 
     @cached_property
     def scores(self) -> Floats:
@@ -61,7 +60,7 @@ class Group:
 
     @cached_property
     def score(self) -> Estimate:
-        return aggregates.of_runs([self.scores], np.random.default_rng(self.rng_seed))
+        return aggregates.of_runs([self.scores], np.random.default_rng(0))
 
     def average(self, values: Iterable[float | None]) -> float | None:
         known = [value for value in values if value is not None]
@@ -70,7 +69,7 @@ class Group:
     def curve(self, key: str) -> list[tuple[int, Estimate]]:
         """(round, the interquartile mean of a metric over the runs), for the rounds that all runs have."""
         rows = [{line["round"]: number(line.get(key)) for line in run.record.rounds} for run in self.runs]
-        rng, found = np.random.default_rng(self.rng_seed), []
+        rng, found = np.random.default_rng(0), []
         for at in sorted(set.intersection(*(set(row) for row in rows))):
             values = [row[at] for row in rows]
             if None not in values:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -59,10 +59,17 @@ class Sweep:
     def run(self, launcher: Launcher, at_once: int) -> Iterator[Ended]:
         """Run what is not finished, some at once. Raises `RunError` where another process does so."""
 
+        stopped = threading.Event()
+
+        def stop() -> None:
+            stopped.set()
+            launcher.stop()
+
         def start(job: Job) -> int:
             # A process of a sweep that was killed may still be at it.
             while owned(job.folder):
-                time.sleep(PATIENCE)
+                if stopped.wait(PATIENCE):
+                    return 130
             job.log.parent.mkdir(parents=True, exist_ok=True)
             return 0 if finished(job.folder) else launcher.call(job)
 
@@ -72,7 +79,7 @@ class Sweep:
         except Timeout:
             raise RunError(f"another process runs the sweep in {self.folder}: wait for it, or stop it") from None
         with lock:
-            for job, status in each(start, launcher.stop, self.jobs, at_once):
+            for job, status in each(start, stop, self.jobs, at_once):
                 yield Ended(job.folder, status, job.log)
 
 
