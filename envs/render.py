@@ -10,9 +10,11 @@ from functools import cache, partial
 from importlib import import_module
 from typing import Any
 
+import gymnasium
 import numpy as np
+from PIL import Image, ImageOps
 
-from prefrl.envs.fast.wrapped import make
+from prefrl.envs.fast.wrapped import is_mujoco, make
 from prefrl.envs.pictures import BLUE, acrobot, cartpole, finished, mountain_car, pendulum, stroke
 from prefrl.types import Floats, Segment
 
@@ -26,12 +28,14 @@ def frames(name: str, segment: Segment, size: int) -> np.ndarray:
     """
     if segment.states is None:
         raise ValueError(
-            f"{name} cannot be drawn: its simulator gives no states to draw from; classic control and MuJoCo "
-            "environments can be"
+            f"{name} cannot be drawn: its simulator gives no states to draw from. Classic control and MuJoCo "
+            "environments can be, and one of your own that has get_state() and set_state(state)"
         )
     draw = _CLASSIC.get(name.split("-")[0])
-    if draw is None:
+    if draw is None and "mujoco" in str(gymnasium.registry[name].entry_point):
         return _mujoco(name, segment.states, size)
+    if draw is None:
+        return _own(name, segment.states, size)
     steps = zip(segment.states, segment.actions, strict=True)
     return np.stack([finished(draw(state, action, size)) for state, action in steps])
 
@@ -56,6 +60,27 @@ _CLASSIC: dict[str, Callable[[Floats, Floats, int], Floats]] = {
     "MountainCarContinuous": partial(_still, partial(mountain_car, goal=0.45)),
 }
 """By what gymnasium's id begins with."""
+
+
+def _own(name: str, states: Floats, size: int) -> np.ndarray:
+    """Pictures that the environment draws itself, brought into one state after another; what is not square gets edges.
+
+    A subclass of MuJoCo's environments, registered elsewhere, is drawn as MuJoCo's are.
+    """
+    env = make(name, render_mode="rgb_array", disable_env_checker=True)
+    if is_mujoco(env):
+        return _mujoco(name, states, size)
+    own: Any = env.unwrapped
+    pictures = []
+    try:
+        env.reset(seed=0)
+        for state in states:
+            own.set_state(state)
+            picture = Image.fromarray(np.asarray(own.render(), np.uint8))
+            pictures.append(np.asarray(ImageOps.pad(picture, (size, size), color="white")))
+    finally:
+        env.close()
+    return np.stack(pictures)
 
 
 # --- MuJoCo -------------------------------------------------------------------------------------------------------

@@ -6,10 +6,14 @@ A config file names a kind; only this table or an installed package's entry poin
 from __future__ import annotations
 
 import difflib
+import importlib.util
+import os
+import sys
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict
@@ -110,6 +114,8 @@ TABLE: dict[Role, dict[str, str]] = {
         "information": "prefrl.sample.select:ScoredSettings",
     },
 }
+PLUGINS = "PREFRL_PLUGINS"
+"""Names the modules and files to load, for processes that this one starts."""
 RENAMED: dict[Role, dict[str, str]] = {"learners": {"ppo": "control"}}
 """Kinds that had another name before: role -> old name -> today's."""
 EXTRAS = {
@@ -179,6 +185,41 @@ def todays(role: Role, saved: dict[str, Any]) -> dict[str, Any]:
     kind = saved.get("kind")
     kind = RENAMED.get(role, {}).get(kind, kind) if isinstance(kind, str) else None
     return settings_class(role, kind).renamed(saved | {"kind": kind}) if kind in kinds(role) else saved
+
+
+def load_plugins(names: Iterable[str] = ()) -> None:
+    """Import modules by name, and Python files (.py) by path, after those that PREFRL_PLUGINS names.
+
+    Processes that this one starts find them there, and load them too. Raises `ConfigError` for what is not there.
+    """
+    known = [name for name in os.environ.get(PLUGINS, "").split(os.pathsep) if name]
+    found = [str(Path(name).resolve()) if name.endswith(".py") else name for name in names]
+    wanted = list(dict.fromkeys([*known, *found]))
+    for name in wanted:
+        _load_file(Path(name)) if name.endswith(".py") else _load_module(name)
+    os.environ[PLUGINS] = os.pathsep.join(wanted)
+
+
+def _load_file(path: Path) -> None:
+    loaded = sys.modules.get(path.stem)
+    if loaded is not None and loaded.__spec__ is not None and loaded.__spec__.origin == str(path):
+        return
+    if loaded is not None:
+        raise ConfigError(f"{path}: a module {path.stem!r} is loaded already; give the file another name")
+    spec = importlib.util.spec_from_file_location(path.stem, path) if path.is_file() else None
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"{path}: no such Python file")
+    sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+
+def _load_module(name: str) -> None:
+    try:
+        import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise  # something that the module itself needs
+        raise ConfigError(f"{name}: no such module; a file is named with its .py") from None
 
 
 def missing(error: ModuleNotFoundError) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -86,7 +86,7 @@ class Config(Settings):
     loop: LoopSettings = LoopSettings()
     """How often, and how much is asked."""
     goal: str = Field("", max_length=200)
-    """What is wanted, as a question: people and judges are asked it, unless the labeler has one of its own."""
+    """What people and judges are asked, unless the labeler has a question of its own."""
     seed: int = Field(0, ge=0)
     """All random numbers of the run come from this one."""
 
@@ -102,25 +102,25 @@ class Config(Settings):
         Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
         """
         data = _read(source)
+        for override in _kinds_first(overrides):
+            _apply(data, override)
         try:
-            return cls._changed(data, overrides)
+            return cls.parse(data)
         except ConfigError as error:
-            given = {override.partition("=")[0] for override in overrides}
+            given = [override.partition("=")[0].split(".") for override in overrides]
             raise ConfigError("\n".join(_placed(line, source, given) for line in str(error).splitlines())) from None
 
     @classmethod
     def reopen(cls, path: Path, overrides: Sequence[str] = ()) -> Config:
         """Read what a run or a reward model was saved with, by this version or an earlier one, with overrides."""
+        if not path.is_file():
+            raise ConfigError(f"{path.parent} holds no run: expected a file {path.name} in it")
         data = _read(path)
         for part, role in ROLES.items():
             if isinstance(data.get(part), dict):
                 data[part] = todays(role, data[part])
-        return cls._changed(data, overrides)
-
-    @classmethod
-    def _changed(cls, data: Json, overrides: Sequence[str]) -> Config:
-        for override in sorted(overrides, key=lambda o: not o.partition("=")[0].endswith("kind")):
-            _apply(data, override)  # kinds first: a new kind drops what was set for the old one
+        for override in _kinds_first(overrides):
+            _apply(data, override)
         return cls.parse(data)
 
     @classmethod
@@ -226,11 +226,11 @@ def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
     return f"{source}, line {mark.line + 1}" if mark else str(source)
 
 
-def _placed(line: str, source: str | Path, given: Collection[str]) -> str:
-    """What is said of a setting, with the line of the file that has it; unless it came as an override."""
+def _placed(line: str, source: str | Path, given: Sequence[list[str]]) -> str:
+    """What is said of a setting, with the line of the file that has it; unless an override has to do with it."""
     path = Path(source)
     names = line.partition(":")[0].split(".")
-    if not path.is_file() or ".".join(names) in given:
+    if not path.is_file() or any(all(a == b for a, b in zip(names, key, strict=False)) for key in given):
         return line
     node, at = yaml.compose(path.read_text(encoding="utf-8"), yaml.SafeLoader), None
     for name in names:
@@ -251,6 +251,11 @@ class _UniqueKeys(yaml.SafeLoader):
         if twice:
             raise yaml.constructor.ConstructorError(None, None, f"{twice[0]!r} is given twice", node.start_mark)
         return super().construct_mapping(node, deep)
+
+
+def _kinds_first(overrides: Sequence[str]) -> list[str]:
+    """A new kind drops what was set for the old one."""
+    return sorted(overrides, key=lambda o: not o.partition("=")[0].endswith("kind"))
 
 
 def _apply(data: Json, override: str) -> None:

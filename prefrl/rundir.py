@@ -285,7 +285,9 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
 
 def _lasting(config: Config) -> Config:
     parts: Json = {name: part.lasting() for name, part in config if isinstance(part, Settings)}
-    return config.model_copy(update=parts | {"goal": ""})
+    if config.labeler.asks_people():  # words to people may get better as a run goes on; a judge's are its settings
+        parts["goal"] = ""
+    return config.model_copy(update=parts)
 
 
 def _hash(saved: Path) -> str:

@@ -87,6 +87,7 @@ def test_python_yaml_and_the_command_line_say_the_same_thing() -> None:
         learner=preset.learner,
         fitting=preset.fitting.model_copy(update={"learning_rate": 1e-4}),
         loop=preset.loop.model_copy(update={"labels": 12}),
+        goal=preset.goal,
         seed=3,
     )
     assert by_override == by_hand

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -146,10 +146,22 @@ def is_mujoco(env: gymnasium.Env[Any, Any]) -> bool:
     return isinstance(env.unwrapped, MujocoEnv)
 
 
+@runtime_checkable
+class Restorable(Protocol):
+    """An environment that can be brought into a state it was in, to be drawn there."""
+
+    def get_state(self) -> Floats:
+        """(S,) numbers that say all that `render` shows."""
+
+    def set_state(self, state: Floats, /) -> None:
+        """Take such a state."""
+
+
 def physics_state(env: gymnasium.Env[Any, Any]) -> Floats | None:
-    """(S,) positions, velocities and activations of a MuJoCo environment; None for others."""
+    """(S,) positions, velocities and activations of a MuJoCo environment, or the own state of one that gives it."""
     if not is_mujoco(env):
-        return None
+        own = env.unwrapped
+        return np.asarray(own.get_state(), np.float64).ravel() if isinstance(own, Restorable) else None
     import mujoco
 
     unwrapped: Any = env.unwrapped

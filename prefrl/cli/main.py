@@ -60,7 +60,7 @@ FEW = 20
 def own(
     plugin: Annotated[
         list[str] | None,
-        typer.Option(help="A Python file (my_env.py) or module of your own to load first: environments, kinds."),
+        typer.Option(help="A Python file (my_env.py) or module of your own to load first."),
     ] = None,
 ) -> None:
     load(plugin or [])
@@ -77,7 +77,7 @@ def run(
         bool, typer.Option(help="Build everything, run a small round, estimate time, write nothing.")
     ] = False,
     ranks: Ranks = 1,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs with as many seeds, from `seed` on, and compares them.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Run this many seeds, from `seed` on, and compare the runs.")] = 1,
     jobs: Jobs = 1,
 ) -> None:
     """Run the whole loop. The same command on the same folder goes on where it stopped."""
@@ -88,6 +88,7 @@ def run(
     config = _load(source, overrides)
     _refuse(seeds > 1 and ranks > 1, "--seeds and --ranks are two ways to use several processes: choose one")
     _refuse(jobs > 1 and seeds == 1, "--jobs goes with --seeds: how many of its runs go on at once")
+    _refuse(seeds > 1 and Path(source).is_dir(), "--seeds takes a preset or a YAML file, not a run's folder")
     if seeds > 1 and not dry_run:
         drive_all(over_seeds(source, overrides, seeds), out or _new_folder(source), jobs, "local")
         return

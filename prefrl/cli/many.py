@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from prefrl.report.groups import Contest
     from prefrl.sweeps.plan import SweepPlan
 
 commands = typer.Typer()
@@ -26,7 +27,7 @@ def sweep(
     jobs: Jobs = 1,
     launcher: Annotated[str, typer.Option(help="local, or submitit (Slurm).")] = "local",
 ) -> None:
-    """Run presets over seeds and a grid of settings. The same command goes on where it stopped."""
+    """Run presets over seeds and a grid of settings. Run it again to go on where it stopped."""
     from prefrl.sweeps.plan import SweepPlan
 
     drive_all(SweepPlan.load(file), out or Path("runs") / file.stem, jobs, launcher)
@@ -34,17 +35,16 @@ def sweep(
 
 @commands.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders that hold such.")],
+    runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or folders that contain runs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="A page (.html), a table (.md) or numbers (.json).")] = Path(
         "comparison.html"
     ),
 ) -> None:
-    """Put finished runs side by side: by task, by what differs in their settings, over their seeds."""
+    """Compare finished runs by task and settings, over their seeds."""
     from prefrl.cli.console import say
     from prefrl.report.comparison import write_comparison
 
-    write_comparison(runs, out)
-    _tell(runs)
+    _tell(*write_comparison(runs, out))
     say(f"comparison: {out}")
 
 
@@ -61,27 +61,27 @@ def over_seeds(source: str, overrides: Sequence[str], seeds: int) -> SweepPlan:
 def drive_all(plan: SweepPlan, folder: Path, at_once: int, where: str) -> None:
     """Run a sweep to its end, a line for each run, and compare what came of it. Raises `RunError` if a run failed."""
     from prefrl.cli.console import counted, say
-    from prefrl.cli.own import options
     from prefrl.report.comparison import write_comparison
     from prefrl.rundir import RunError
     from prefrl.sweeps.drive import Sweep
     from prefrl.sweeps.launch import launcher
 
-    sweep, failed = Sweep(plan, folder, options()), list[Path]()
+    started, sweep, failed = launcher(where, folder / ".jobs"), Sweep(plan, folder), list[Path]()
     left = len(sweep.jobs)
+    say(f"the folder of the runs: {folder}")
     if left < len(sweep.members):
         say(f"{len(sweep.members) - left} of {len(sweep.members)} runs in {folder} are finished")
     try:
-        for ended in counted(sweep.run(launcher(where, folder / ".jobs"), at_once), left, "runs"):
+        for ended in counted(sweep.run(started, at_once), left, "runs"):
             failed += [ended.log] * bool(ended.status)
             say(f"{ended.folder}: {_outcome(ended.folder, ended.status)}")
     except KeyboardInterrupt:
-        say("stopped; what was finished is kept. Go on with the same command")
+        say(f"stopped; finished runs are kept. Go on with the same command and --out {folder}")
         raise
     if failed:
-        raise RunError(f"{len(failed)} of {len(sweep.members)} runs failed; what they said is in {failed[0]}")
-    page = write_comparison([folder], folder / "comparison.html")
-    _tell([folder])
+        raise RunError(f"{len(failed)} of {len(sweep.members)} runs failed; see their logs, for example {failed[0]}")
+    page = folder / "comparison.html"
+    _tell(*write_comparison([folder / member.name for member in sweep.members], page))
     say(f"comparison: {page}")
 
 
@@ -93,11 +93,10 @@ def _outcome(folder: Path, status: int) -> str:
     return f"failed, with status {status}" if status else headline(gather(read(folder, examples=False)))
 
 
-def _tell(paths: Sequence[Path]) -> None:
+def _tell(found: Sequence[Contest], left_out: Sequence[str]) -> None:
     from prefrl.cli.console import console, say, table
-    from prefrl.report.comparison import compare, rows_of
+    from prefrl.report.comparison import rows_of
 
-    found, left_out = compare(paths)
     for contest in found:
         rows = rows_of(contest)
         shown = [name for name in rows[0].columns if name in TOLD]

@@ -64,17 +64,17 @@ def compare(paths: Sequence[Path]) -> tuple[list[Contest], list[str]]:
     return found, unfinished(runs)
 
 
-def write_comparison(paths: Sequence[Path], to: Path) -> Path:
+def write_comparison(paths: Sequence[Path], to: Path) -> tuple[list[Contest], list[str]]:
     """Compare the runs in some folders in a page (.html), a table (.md), or numbers (.json), by the file's name.
 
     Raises `ValueError` where no run is finished, or the name ends otherwise.
     """
     forms = {".html": _page, ".md": markdown, ".json": _numbers}
     if to.suffix not in forms:
-        raise ValueError(f"{to}: expected a name that ends in {', '.join(forms)}")
+        raise ValueError(f"{to}: expected a name that ends in .html, .md or .json")
     found, left_out = compare(paths)
     write_file(to, forms[to.suffix](found, left_out).encode())
-    return to
+    return found, left_out
 
 
 def _page(found: Sequence[Contest], left_out: Sequence[str]) -> str:
@@ -108,7 +108,8 @@ def _numbers(found: Sequence[Contest], left_out: Sequence[str]) -> str:
             "interquartile_mean": group.score.value,
             "interval": [group.score.low, group.score.high],
             "runs": [
-                {"folder": str(run.folder), "seed": run.facts.seed, "score": ended(run.facts)} for run in group.runs
+                {"folder": str(run.folder), "seed": run.facts.seed, "score": ended(run.facts, contest.by_gold)}
+                for run in group.runs
             ],
         }
         for contest in found
@@ -118,7 +119,7 @@ def _numbers(found: Sequence[Contest], left_out: Sequence[str]) -> str:
 
 
 def rows_of(contest: Contest) -> list[Row]:
-    """What each group comes to; a column that no group fills is left out."""
+    """The results of each group; a column that no group fills is left out."""
     rows = [(letter, group.name, _columns(contest, group)) for letter, group in _lettered(contest)]
     kept = [name for name in rows[0][2] if any(columns[name] != "–" for _, _, columns in rows)]
     return [Row(letter, name, {key: columns[key] for key in kept}) for letter, name, columns in rows]
@@ -129,7 +130,7 @@ def _columns(contest: Contest, group: Group) -> dict[str, str]:
     facts = [run.facts for run in group.runs]
     before = group.average(f.gold[0] for f in facts) if contest.by_gold else None
     return {
-        "runs": show_count(len(group.runs)),
+        "runs": show_count(len(group.scores)),
         "before": show_number(before, group.score.value),
         "gold" if contest.by_gold else "wins against the start": _with_interval(group.score, contest.by_gold),
         "worst": show(min(group.scores.tolist(), default=None)),
@@ -174,7 +175,7 @@ def _against_all(contest: Contest, ours: Group) -> tuple[str, ...]:
 def _chance(of: Estimate) -> str:
     if of.value is None:
         return "–"
-    return f"{of.value:.2f}" if of.low is None else f"{of.value:.2f} ({of.low:.2f} to {of.high or 1:.2f})"
+    return f"{of.value:.2f}" if of.low is None else f"{of.value:.2f} ({of.low:.2f} to {_known(of.high, 1.0):.2f})"
 
 
 def _headline(contest: Contest) -> str:
@@ -186,7 +187,7 @@ def _headline(contest: Contest) -> str:
     if len(lettered) == 1:
         return f"{show_count(len(best.runs), 'run')}: {said}."
     chances = {other: contest.improvement(best, group) for other, group in lettered if group is not best}
-    nearest = min(chances, key=lambda other: _known(chances[other].value, 1.0))
+    nearest = min(chances, key=lambda other: _known(chances[other].low, 0.0))
     low = chances[nearest].low
     if low is None or low <= 0.5:
         return f"No group is surely ahead. {letter}, {best.name}, has {said}; against {nearest} that may be luck."
@@ -202,22 +203,22 @@ def _cards(contest: Contest, name: str) -> tuple[Card, ...]:
     styles = list(islice(cycle((colour, dash) for dash in DASHES for colour in COLOURS), len(contest.groups)))
     lettered = _lettered(contest)
     strips = [
-        Strip(letter, group.scores.tolist(), group.score.value, group.score.low, group.score.high)
-        for letter, group in lettered
+        Strip(letter, group.scores.tolist(), group.score.value, group.score.low, group.score.high, colour)
+        for (letter, group), (colour, _) in zip(lettered, styles, strict=True)
         if group.score.value is not None
     ]
     what = "gold" if contest.by_gold else "wins against the start"
     found = [
         Card(
             f"Where they ended: {what}",
-            plots.strips(f"{name}-ended", strips, [colour for colour, _ in styles[: len(strips)]], what),
+            plots.strips(f"{name}-ended", strips, what),
             "Each dot is a run; the diamond is the mean of the middle half, with its 95 % interval.",
         ),
         *_over_rounds(contest, styles, name),
         Card(
             "How many runs got how far",
             _profiles(contest, styles, f"{name}-profile"),
-            f"The share of runs that ended above each value of {what}: the curve further up and right is better.",
+            f"The share of runs that ended above each value of {what}: higher and further right is better.",
         ),
     ]
     return tuple(card for card in found if card.figure)
@@ -248,6 +249,8 @@ def _profiles(contest: Contest, styles: Sequence[tuple[str, str]], name: str) ->
     at = np.linspace(scores.min() - 0.02 * np.ptp(scores), scores.max(), STEPS)
     curves = []
     for (letter, group), (colour, dash) in zip(_lettered(contest), styles, strict=True):
+        if not len(group.scores):
+            continue
         share, low, high = aggregates.profile([group.scores], at, np.random.default_rng(0))
         line = Line(share.tolist(), colour, letter, dash, low.tolist(), high.tolist())
         curves.append((at.tolist(), line))

@@ -1,4 +1,4 @@
-"""Runs side by side: which belong together, what tells them apart, and what each group comes to."""
+"""Runs side by side: which belong together, what tells them apart, and the results of each group."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from prefrl.types import Floats
 
 SHOWN = 3
 """Settings that a group is named by; where more differ it is named by its folder."""
-APART = ("seed", "goal", "labeler.port", "labeler.host", "labeler.clips")
+APART = ("seed", "labeler.port", "labeler.host", "labeler.clips")
 """Settings that may differ within a group."""
 
 
@@ -52,11 +52,13 @@ class Group:
 
     name: str
     runs: tuple[Seen, ...]
+    by_gold: bool
+    """Whether the score is gold; else it is the share of wins against the start."""
 
     @cached_property
     def scores(self) -> Floats:
-        """(S,) what the runs ended with: gold, or where there is none their wins against the start."""
-        return np.array([found for run in self.runs if (found := ended(run.facts)) is not None])
+        """What the runs ended with, of those that have a score."""
+        return np.array([found for run in self.runs if (found := ended(run.facts, self.by_gold)) is not None])
 
     @cached_property
     def score(self) -> Estimate:
@@ -90,9 +92,9 @@ class Contest:
         return aggregates.improvement([ours.scores], [theirs.scores], np.random.default_rng(0))
 
 
-def ended(facts: Facts) -> float | None:
-    """A run's score."""
-    if facts.gold[1] is not None:
+def ended(facts: Facts, by_gold: bool) -> float | None:
+    """A run's score: its last gold, or its share of wins against the start."""
+    if by_gold:
         return facts.gold[1]
     return None if facts.won is None else facts.won.value
 
@@ -102,7 +104,9 @@ def found_in(paths: Sequence[Path]) -> list[Seen]:
     folders: dict[Path, Path] = {}
     for path in paths:
         if not path.is_dir():
-            raise ValueError(f"{path}: no such folder")
+            raise ValueError(
+                f"{path} is a file: expected a run's folder" if path.is_file() else f"{path}: no such folder"
+            )
         own = [path] if (path / "metrics.jsonl").is_file() else sorted(p.parent for p in path.rglob("metrics.jsonl"))
         if not own:
             raise ValueError(f"{path} holds no run: expected metrics.jsonl in it, or in a folder in it")
@@ -121,9 +125,9 @@ def contests(runs: Sequence[Seen]) -> list[Contest]:
             alike.setdefault(repr(sorted(run.settings.items())), []).append(run)
         groups = [tuple(sorted(group, key=lambda run: run.seed)) for group in alike.values()]
         if groups:
-            names = _names(groups)
-            by_gold = all(run.facts.gold[1] is not None for run in kept)
-            found.append(Contest(task, tuple(map(Group, names, groups)), by_gold))
+            by_gold = any(run.facts.gold[0] is not None or run.facts.gold[1] is not None for run in kept)
+            made = (Group(name, group, by_gold) for name, group in zip(_names(groups), groups, strict=True))
+            found.append(Contest(task, tuple(made), by_gold))
     return found
 
 
@@ -174,8 +178,13 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def unfinished(runs: Sequence[Seen]) -> list[str]:
-    """What is said of the runs that are left out."""
-    return [
+    """A line for each run that is left out."""
+    lost = [
+        f"{run.folder}: it has no score, its last gold is not a number"
+        for run in runs
+        if run.facts.finished and ended(run.facts, True) is None and ended(run.facts, False) is None
+    ]
+    return lost + [
         f"{run.folder}: not finished, round {run.facts.rounds} of {run.facts.planned or '?'}"
         for run in runs
         if not run.facts.finished

@@ -113,6 +113,8 @@ class Strip:
     mean: float
     low: float | None
     high: float | None
+    colour: str
+    """A name in `COLOURS`."""
 
 
 def several(name: str, curves: Sequence[tuple[Sequence[float], Line]], label: str) -> Markup:
@@ -130,13 +132,13 @@ def several(name: str, curves: Sequence[tuple[Sequence[float], Line]], label: st
     return _svg(name, draw) if drawn else Markup("")
 
 
-def strips(name: str, found: Sequence[Strip], colours: Sequence[str], label: str) -> Markup:
+def strips(name: str, found: Sequence[Strip], label: str) -> Markup:
     """A row for each group: its runs as dots, their mean with its interval; empty without groups."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        for at, (strip, colour) in enumerate(zip(found, colours, strict=True)):
-            shade = COLOURS[colour]
+        for at, strip in enumerate(found):
+            shade = COLOURS[strip.colour]
             axes.scatter(strip.values, [at] * len(strip.values), s=22, color=shade, alpha=0.45, linewidths=0)
             if strip.low is not None and strip.high is not None:
                 axes.hlines(at + 0.22, strip.low, strip.high, color=shade, linewidth=2.2)

@@ -1,4 +1,4 @@
-"""What several runs come to, after Agarwal et al. 2021 ("Deep RL at the edge of the statistical precipice").
+"""Statistics over several runs, after Agarwal et al. 2021 ("Deep RL at the edge of the statistical precipice").
 
 Runs are resampled within their task (stratified), so that a task with more seeds does not count for more. Intervals
 are 95 % percentiles of the bootstrap; it knows only the runs that there are, and is narrow for few.

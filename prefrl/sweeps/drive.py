@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from prefrl.storage.files import write_file
 from prefrl.sweeps.launch import Job, Launcher, each
 from prefrl.sweeps.plan import Member, SweepPlan
 
-PLAN = "sweep.yaml"
+PLAN = "plan.yaml"
 PATIENCE = 1.0
 """Seconds between two looks at a folder that another process writes to."""
 
@@ -33,32 +33,33 @@ class Ended(NamedTuple):
 class Sweep:
     """The folder of a sweep. A folder with another plan is refused, unless the plan holds all of its runs."""
 
-    def __init__(self, plan: SweepPlan, folder: Path, options: Sequence[str] = ()) -> None:
-        """`options`: of `prefrl` itself, that come before each command, such as `--plugin my_env.py`.
-
-        Raises `ConfigError` for a wrong setting of any run, and `RunError` for a folder of something else."""
-        self.folder, self.members, self._options = folder, plan.members(), tuple(options)
+    def __init__(self, plan: SweepPlan, folder: Path) -> None:
+        """Raises `ConfigError` for a wrong setting of any run, and `RunError` for a folder of something else."""
+        self.folder, self.members = folder, plan.members()
         if (folder / "config.yaml").exists():
             raise RunError(f"{folder} holds a single run: choose another folder")
-        there = folder / PLAN
-        if there.exists():
-            missing = _missing(SweepPlan.load(there).members(), self.members)
-            if missing:
-                raise RunError(f"{folder} holds a sweep with other runs ({missing[0]}): choose another folder")
-        write_file(there, yaml.safe_dump(plan.model_dump(mode="json"), sort_keys=False).encode())
+        self._plan = plan
+        self._refuse_others()
+
+    def _refuse_others(self) -> None:
+        there = self.folder / PLAN
+        missing = _missing(SweepPlan.load(there).members(), self.members) if there.exists() else []
+        if missing:
+            raise RunError(f"{self.folder} holds a sweep with other runs ({missing[0]}): choose another folder")
+
+    def _claim(self) -> None:
+        self._refuse_others()
+        text = yaml.safe_dump(self._plan.model_dump(mode="json"), sort_keys=False)
+        write_file(self.folder / PLAN, text.encode())
 
     @property
     def jobs(self) -> list[Job]:
         """What is not finished yet."""
-        jobs = [
-            Job(member, self.folder / member.name, self.folder / f"{member.name}.log", self._options)
-            for member in self.members
-        ]
+        jobs = [Job(member, self.folder / member.name, self.folder / f"{member.name}.log") for member in self.members]
         return [job for job in jobs if not finished(job.folder)]
 
     def run(self, launcher: Launcher, at_once: int) -> Iterator[Ended]:
         """Run what is not finished, some at once. Raises `RunError` where another process does so."""
-
         stopped = threading.Event()
 
         def stop() -> None:
@@ -73,12 +74,13 @@ class Sweep:
             job.log.parent.mkdir(parents=True, exist_ok=True)
             return 0 if finished(job.folder) else launcher.call(job)
 
-        lock = FileLock(self.folder / "sweep.lock", timeout=0)
+        self.folder.mkdir(parents=True, exist_ok=True)
         try:
-            lock.acquire()
+            held = FileLock(self.folder / "sweep.lock", timeout=0).acquire()
         except Timeout:
             raise RunError(f"another process runs the sweep in {self.folder}: wait for it, or stop it") from None
-        with lock:
+        with held:
+            self._claim()
             for job, status in each(start, stop, self.jobs, at_once):
                 yield Ended(job.folder, status, job.log)
 

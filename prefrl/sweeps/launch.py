@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -22,21 +23,19 @@ from prefrl.sweeps.plan import Member
 STOPPING = 30.0
 """Seconds that runs are given to stop in good order."""
 HOURS = 72
-"""That a job of a cluster may take."""
+"""The time limit of a cluster job, in hours."""
 
 
 class Job(NamedTuple):
-    """A run that is to be started."""
+    """A run to start."""
 
     member: Member
     folder: Path
     log: Path
     """Takes what the command says."""
-    options: tuple[str, ...] = ()
-    """Of `prefrl` itself."""
 
     def command(self) -> list[str]:
-        run = [sys.executable, "-m", "prefrl", *self.options, "run"]
+        run = [sys.executable, "-m", "prefrl", "run"]
         return [*run, self.member.source, *self.member.overrides, "--out", str(self.folder)]
 
 
@@ -47,7 +46,7 @@ class Launcher(Protocol):
         """Run it to its end, and give its exit status; called from several threads."""
 
     def stop(self) -> None:
-        """Stop what is running, in good order; nothing is started any more."""
+        """Stop what is running; nothing is started any more."""
 
 
 def launcher(name: str, state: Path) -> Launcher:
@@ -102,11 +101,12 @@ class Local:
             left = list(self._running)
         for process in left:
             process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + STOPPING
         for process in left:
             try:
-                process.wait(STOPPING)
+                process.wait(max(deadline - time.monotonic(), 0.0))
             except subprocess.TimeoutExpired:
-                process.kill()
+                os.killpg(process.pid, signal.SIGKILL)  # and what it has started
 
 
 class Submitit:
@@ -133,8 +133,9 @@ class Submitit:
     def stop(self) -> None:
         with self._lock:
             self._stopped = True
-            for sent in self._running:
-                sent.cancel(check=False)
+            left = list(self._running)
+        for sent in left:
+            sent.cancel(check=False)
 
 
 def _called(command: list[str], log: str) -> int:

@@ -1,14 +1,15 @@
-"""Which runs a sweep is made of: presets, a grid of settings, seeds."""
+"""The runs of a sweep: presets, a grid of settings, seeds."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
@@ -36,8 +37,15 @@ class SweepPlan(Settings):
     """The first seed; the others follow it."""
     set: tuple[str, ...] = ()
     """Settings of all runs, as `dotted.key=value`."""
-    grid: dict[str, tuple[Any, ...]] = Field({})
+    grid: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field({})
     """Settings and the values that they take: all combinations are run."""
+
+    @field_validator("set", "grid")
+    @classmethod
+    def _leaves_the_seeds_alone(cls, given: Any) -> Any:
+        if any(one.partition("=")[0] == "seed" for one in given):
+            raise ValueError("seed: set it with `first` and `seeds`")
+        return given
 
     @classmethod
     def load(cls, path: Path) -> SweepPlan:
@@ -54,19 +62,22 @@ class SweepPlan(Settings):
     def members(self) -> list[Member]:
         """All runs, the seeds of one variant after another's.
 
-        The settings of each are built, so that a mistake is told before anything is started. Raises `ConfigError`.
+        The settings of each are built, so that a mistake is reported before anything starts. Raises `ConfigError`.
         """
         found = []
         for source, values in product(self.presets, product(*self.grid.values())):
             chosen = [f"{key}={_written(value)}" for key, value in zip(self.grid, values, strict=True)]
             variant = ",".join([Path(source).stem if Path(source).is_file() else source.replace("/", "-"), *chosen])
-            Config.load(source, [*self.set, *chosen])
+            if Config.load(source, [*self.set, *chosen]).labeler.asks_people():
+                raise ConfigError("labeler.kind: a sweep cannot ask people; choose oracle, crowd or judge")
             for seed in range(self.first, self.first + self.seeds):
                 name = f"{_for_a_folder(variant)}/seed-{seed}"
                 found.append(Member(name, source, (*self.set, *chosen, f"seed={seed}")))
-        twice = sorted({m.name for m in found if sum(m.name == other.name for other in found) > 1})
+        twice = [name for name, count in Counter(member.name for member in found).items() if count > 1]
         if twice:
-            raise ConfigError(f"two runs of the sweep would share the folder {twice[0]}: give their files other names")
+            raise ConfigError(
+                f"two runs would share the folder {twice[0]}: a value or preset is listed twice, or names are alike"
+            )
         return found
 
 

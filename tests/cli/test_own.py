@@ -1,5 +1,6 @@
 """Code of one's own, named in the command and nowhere else."""
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 import yaml
 
 from prefrl.cli import own
-from prefrl.components import ConfigError
+from prefrl.components import PLUGINS, ConfigError
 from prefrl.config import Config
 
 FILE = """
@@ -20,9 +21,9 @@ gymnasium.register("OwnPendulum-v0", PendulumEnv, max_episode_steps=50)
 
 
 @pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv(PLUGINS, "")
     yield
-    own.LOADED.clear()
     sys.modules.pop("own_pendulum", None)
     gymnasium.registry.pop("OwnPendulum-v0", None)
 
@@ -31,7 +32,7 @@ def test_a_module_before_the_id_is_loaded_and_the_id_alone_is_kept(tmp_path: Pat
     file = tmp_path / "own_pendulum.py"
     file.write_text(FILE)
     assert own.by_name([f"task.env={file}:OwnPendulum-v0", "seed=3"]) == ["task.env=OwnPendulum-v0", "seed=3"]
-    assert own.options() == ["--plugin", str(file)]
+    assert os.environ[PLUGINS] == str(file)
     own.load([str(file)])  # a second time changes nothing
     config = Config.load("control/pendulum", ["task.env=OwnPendulum-v0"])
     assert config.build_task().name == "OwnPendulum-v0"

@@ -35,6 +35,19 @@ def test_runs_that_differ_in_their_seeds_are_one_group_named_by_what_differs(two
     assert contest.improvement(*contest.groups).value == 1.0
 
 
+def test_who_always_loses_has_no_chance_and_the_page_says_so(two_rates: Path, tmp_path: Path) -> None:
+    write_comparison([two_rates], tmp_path / "page.html")
+    assert "0.00 (0.00 to 0.00)" in (tmp_path / "page.html").read_text()
+
+
+def test_a_run_whose_last_gold_is_lost_is_named_and_gold_stays_the_measure(two_rates: Path) -> None:
+    lost = folder_of_run(two_rates / "slow-9", [-10.0, -8.0, None], settings(9, 0.1))
+    (contest,), left_out = compare([two_rates])
+    assert contest.by_gold
+    assert [len(group.scores) for group in contest.groups] == [4, 4]
+    assert left_out == [f"{lost}: it has no score, its last gold is not a number"]
+
+
 def test_of_two_kinds_only_the_kind_is_named(tmp_path: Path) -> None:
     folder_of_run(tmp_path / "a", [0.0, 1.0], {"seed": 0, "learner": {"kind": "dpo", "beta": 0.1}})
     folder_of_run(tmp_path / "b", [0.0, 1.0], {"seed": 0, "learner": {"kind": "kto", "rate": 0.2}})
@@ -70,14 +83,17 @@ def test_a_folder_without_runs_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_page_a_table_and_numbers_are_written_by_the_files_name(two_rates: Path, tmp_path: Path) -> None:
-    page = write_comparison([two_rates], tmp_path / "page.html").read_text()
+    write_comparison([two_rates], tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
     assert page.count("<svg") == 3
     assert "A, learning_rate=0.5, is ahead" in page
     assert "NaN" not in page
-    table = write_comparison([two_rates], tmp_path / "table.md").read_text()
+    write_comparison([two_rates], tmp_path / "table.md")
+    table = (tmp_path / "table.md").read_text()
     assert "**Pendulum-v1**, seeds 0 to 3; prefrl 0.1" in table
     assert "| learning_rate=0.5 | 4 | −10.0 | −1.15 (" in table
-    numbers = json.loads(write_comparison([two_rates], tmp_path / "n.json").read_text())
+    write_comparison([two_rates], tmp_path / "n.json")
+    numbers = json.loads((tmp_path / "n.json").read_text())
     assert numbers["groups"][1]["interquartile_mean"] == pytest.approx(-7.5)
     assert [run["seed"] for run in numbers["groups"][0]["runs"]] == [0, 1, 2, 3]
     with pytest.raises(ValueError, match="ends in"):
@@ -86,7 +102,8 @@ def test_a_page_a_table_and_numbers_are_written_by_the_files_name(two_rates: Pat
 
 def test_what_a_folder_is_called_is_no_markup(tmp_path: Path) -> None:
     folder_of_run(tmp_path / "<b>|x", [0.0, 1.0], settings(0), task="<i>")
-    assert "<b>" not in write_comparison([tmp_path], tmp_path / "page.html").read_text()
+    write_comparison([tmp_path], tmp_path / "page.html")
+    assert "<b>" not in (tmp_path / "page.html").read_text()
     assert "<b>\\|x" in markdown(*compare([tmp_path]))
 
 

@@ -69,6 +69,12 @@ def test_a_mistake_in_any_run_is_told_before_one_is_started(tmp_path: Path) -> N
     file.write_text("presets: [")
     with pytest.raises(ConfigError, match="not valid YAML"):
         SweepPlan.load(file)
+    with pytest.raises(ValueError, match="set it with `first` and `seeds`"):
+        SweepPlan(presets=("control/toy",), grid={"seed": (1, 2)})
+    with pytest.raises(ConfigError, match="cannot ask people"):
+        SweepPlan(presets=("control/toy",), set=("labeler.kind=web",)).members()
+    with pytest.raises(ConfigError, match="listed twice"):
+        SweepPlan(presets=("control/toy", "control/toy")).members()
     with pytest.raises(ConfigError, match="unknown launcher 'slurn'"):
         launcher("slurn", tmp_path)
 
@@ -83,8 +89,8 @@ def test_what_is_finished_is_not_run_again_and_what_failed_is(tmp_path: Path) ->
 
 
 def test_a_folder_may_get_more_runs_but_no_others(tmp_path: Path) -> None:
-    Sweep(SweepPlan(presets=("control/toy",), seeds=2), tmp_path)
-    assert len(Sweep(SweepPlan(presets=("control/toy",), seeds=4), tmp_path).jobs) == 4
+    list(Sweep(SweepPlan(presets=("control/toy",), seeds=2), tmp_path).run(Pretend(failing="control-toy/seed-0"), 1))
+    assert len(Sweep(SweepPlan(presets=("control/toy",), seeds=4), tmp_path).jobs) == 3
     with pytest.raises(RunError, match="other runs"):
         Sweep(SweepPlan(presets=("control/toy",), seeds=4, set=("loop.rounds=2",)), tmp_path)
     (tmp_path / "run").mkdir()
@@ -122,6 +128,7 @@ def test_a_sweep_that_is_killed_ends_in_the_same_digits_wherever_its_runs_are_st
         deadline = time.monotonic() + 60
         while not list((tmp_path / "killed").rglob("owner.lock")) and time.monotonic() < deadline:
             time.sleep(0.05)
+        assert list((tmp_path / "killed").rglob("owner.lock"))
         os.kill(driver.pid, signal.SIGKILL)
     killed = Sweep(plan, tmp_path / "killed")
     assert all(ended.status == 0 for ended in killed.run(Local(), 2))

@@ -22,7 +22,7 @@ from typing import Any, TextIO, cast
 
 import yaml
 
-from prefrl.components import settings_class
+from prefrl.components import load_plugins, settings_class
 from prefrl.kinds import kind_of, named
 from prefrl.page.clips.encode import NAME, encode
 from prefrl.protocols import DrawnTask, TaskSettings
@@ -85,6 +85,7 @@ def main(folder: str) -> None:
     incoming, outgoing = _own_pipes()
     jobs: SimpleQueue[str] = SimpleQueue()
     Thread(target=_listen, args=(incoming, jobs), daemon=True).start()
+    load_plugins()
     artist = Artist(Path(folder))
     while True:
         outgoing.write(json.dumps(_reply(artist, json.loads(jobs.get()))) + "\n")
