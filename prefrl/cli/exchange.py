@@ -121,6 +121,8 @@ def export_(
         say(f"left out: {count} x {name}", "yellow")
     for note in done.notes:
         say(note, "yellow")
+    if not done.written:
+        raise ValueError(f"{store} holds nothing that {form.value} can say: {to} is empty")
     say(f"{done.written} written to {to}")
 
 

@@ -59,21 +59,10 @@ EXPORTS: Mapping[str, Callable[[Store, Path, str], Exported]] = {
 
 
 def export(store: Store, path: Path, form: str = "preferences", ties: str = "drop") -> Exported:
-    """Write the answers of a store to a file or a folder, whole or not at all.
-
-    Raises `ValueError` where there is nothing to write.
-    """
+    """Write the answers of a store to a file or a folder, whole or not at all."""
     if ties != "drop" and form not in ("preferences", "conversational"):
         raise ValueError(f"ties={ties!r} is for preferences and conversational; the form {form!r} has its own way")
-    counts = store.counts()
-    if not (counts["asked"] if form == "bundle" else counts["answered"] + counts["skipped"]):
-        raise ValueError(f"{store.folder} holds no answers yet: there is nothing to export")
-    done = EXPORTS[form](store, path, ties)
-    if not done.written and path.is_file():
-        path.unlink()
-        why = "; ".join(f"{count} x {name}" for name, count in done.dropped.items())
-        raise ValueError(f"nothing in {store.folder} can be written as {form}; left out: {why or 'nothing'}")
-    return done
+    return EXPORTS[form](store, path, ties)
 
 
 # --- in -----------------------------------------------------------------------------------------------------------
