@@ -10,7 +10,7 @@ from prefrl.cli.main import main
 from prefrl.exchange.ports import EXPORTS
 from prefrl.exchange.text_rows import FORMS
 from prefrl.store import Store
-from prefrl.types import Response
+from prefrl.types import Query, Response
 
 ROW = {"prompt": "p", "chosen": "a", "rejected": "b", "labeler": "ann"}
 Command = Callable[[str], tuple[int, str]]
@@ -48,6 +48,13 @@ def test_an_export_says_what_it_left_out(prefrl: Command) -> None:
     assert "1 written to out.jsonl" in printed
     code, printed = prefrl("export labels --to out.csv --form csv --ties both")
     assert (code, "has its own way" in printed) == (2, True)
+
+
+def test_an_export_of_nothing_fails(prefrl: Command) -> None:
+    with Store[Response](Path("asked")) as store:
+        store.ask([Query((Response("p", "a"), Response("p", "b")))])
+    code, printed = prefrl("export asked --to out.jsonl")
+    assert (code, "asked holds nothing that preferences can say" in printed) == (2, True)
 
 
 def test_a_dry_run_writes_nothing(prefrl: Command) -> None:
