@@ -67,12 +67,15 @@ class Sweep:
             launcher.stop()
 
         def start(job: Job) -> int:
-            # A process of a sweep that was killed may still be at it.
-            while owned(job.folder):
-                if stopped.wait(PATIENCE):
-                    return 130
             job.log.parent.mkdir(parents=True, exist_ok=True)
-            return 0 if finished(job.folder) else launcher.call(job)
+            while True:
+                # A process of a sweep that was killed may still be at it, or get to it while this one starts.
+                while owned(job.folder):
+                    if stopped.wait(PATIENCE):
+                        return 130
+                status = 0 if finished(job.folder) else launcher.call(job)
+                if not status or not owned(job.folder):
+                    return status
 
         self.folder.mkdir(parents=True, exist_ok=True)
         try:

@@ -144,6 +144,7 @@ def test_a_sweep_that_is_killed_ends_in_the_same_digits_wherever_its_runs_are_st
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("heard")
 def test_ctrl_c_stops_the_runs_in_good_order(tmp_path: Path) -> None:
     sweep = Sweep(SweepPlan(presets=("control/toy",), seeds=1, set=("loop.rounds=50",)), tmp_path)
     local = Local()
