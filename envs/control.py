@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -108,6 +108,7 @@ class ControlSettings(Settings):
             make=environments,
             part=environments if parted else None,
             notes=notes,
+            options=self.options,
         )
 
     def _make(self) -> tuple[Make, gymnasium.Env[Any, Any]]:
@@ -198,6 +199,8 @@ class GymnasiumTask:
     make: Callable[[int], Environments]
     part: Callable[[int, range], Environments] | None = None
     notes: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """The environment's keyword arguments, for drawing."""
 
     @property
     def kind(self) -> str:
@@ -212,7 +215,7 @@ class GymnasiumTask:
     def frames(self, segment: Segment) -> np.ndarray:
         from prefrl.envs.render import frames
 
-        return frames(self.name, segment, self.frame_size)
+        return frames(self.name, segment, self.frame_size, self.options)
 
 
 def _environments(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
@@ -21,8 +22,8 @@ from prefrl.types import Floats, Segment
 INSTALL = "apt-get install -y libegl1 libgl1-mesa-dri"
 
 
-def frames(name: str, segment: Segment, size: int) -> np.ndarray:
-    """(T, size, size, 3) uint8 pictures of a segment of the environment `name`.
+def frames(name: str, segment: Segment, size: int, options: Mapping[str, Any] = MappingProxyType({})) -> np.ndarray:
+    """(T, size, size, 3) uint8 pictures of a segment of the environment `name`, which is made with `options`.
 
     Raises ValueError where the segment keeps no states, and RuntimeError where there is no OpenGL for MuJoCo.
     """
@@ -33,9 +34,9 @@ def frames(name: str, segment: Segment, size: int) -> np.ndarray:
         )
     draw = _CLASSIC.get(name.split("-")[0])
     if draw is None and "mujoco" in str(gymnasium.registry[name].entry_point):
-        return _mujoco(name, segment.states, size)
+        return _mujoco(make(name, disable_env_checker=True, **options), segment.states, size)
     if draw is None:
-        return _own(name, segment.states, size)
+        return _own(make(name, render_mode="rgb_array", disable_env_checker=True, **options), segment.states, size)
     steps = zip(segment.states, segment.actions, strict=True)
     return np.stack([finished(draw(state, action, size)) for state, action in steps])
 
@@ -62,14 +63,13 @@ _CLASSIC: dict[str, Callable[[Floats, Floats, int], Floats]] = {
 """By what gymnasium's id begins with."""
 
 
-def _own(name: str, states: Floats, size: int) -> np.ndarray:
+def _own(env: gymnasium.Env[Any, Any], states: Floats, size: int) -> np.ndarray:
     """Pictures that the environment draws itself, brought into one state after another; what is not square gets edges.
 
     A subclass of MuJoCo's environments, registered elsewhere, is drawn as MuJoCo's are.
     """
-    env = make(name, render_mode="rgb_array", disable_env_checker=True)
     if is_mujoco(env):
-        return _mujoco(name, states, size)
+        return _mujoco(env, states, size)
     own: Any = env.unwrapped
     pictures = []
     try:
@@ -87,11 +87,11 @@ def _own(name: str, states: Floats, size: int) -> np.ndarray:
 # Not mujoco.Renderer: which OpenGL that uses hangs on an environment variable read when it is first imported.
 
 
-def _mujoco(name: str, states: Floats, size: int) -> np.ndarray:
+def _mujoco(made: gymnasium.Env[Any, Any], states: Floats, size: int) -> np.ndarray:
     import mujoco
 
     with _context(size):
-        env = _model(name, size)
+        env = _set_up(made, size)
         scene, option, data = mujoco.MjvScene(env.model, 1000), mujoco.MjvOption(), mujoco.MjData(env.model)
         camera, view = _camera(env), mujoco.MjrRect(0, 0, size, size)
         graphics_ = mujoco.MjrContext(env.model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -109,9 +109,9 @@ def _mujoco(name: str, states: Floats, size: int) -> np.ndarray:
     return pictures[:, ::-1]  # OpenGL's first row is the lowest
 
 
-def _model(name: str, size: int) -> Any:
-    """The gymnasium environment, its model set up for fast drawing; before the OpenGL context's buffers are made."""
-    env: Any = make(name, disable_env_checker=True).unwrapped
+def _set_up(made: gymnasium.Env[Any, Any], size: int) -> Any:
+    """The environment, its model set up for fast drawing; before the OpenGL context's buffers are made."""
+    env: Any = made.unwrapped
     visual = env.model.vis
     visual.quality.offsamples = visual.quality.shadowsize = 0
     visual.global_.offwidth, visual.global_.offheight = size, size

@@ -200,6 +200,12 @@ def load_plugins(names: Iterable[str] = ()) -> None:
     os.environ[PLUGINS] = os.pathsep.join(wanted)
 
 
+def resume_command(folder: Path) -> str:
+    """What goes on with a run, as it is typed."""
+    known = [name for name in os.environ.get(PLUGINS, "").split(os.pathsep) if name]
+    return " ".join(["prefrl", *(f"--plugin {name}" for name in known), "resume", str(folder)])
+
+
 def _load_file(path: Path) -> None:
     loaded = sys.modules.get(path.stem)
     if loaded is not None and loaded.__spec__ is not None and loaded.__spec__.origin == str(path):

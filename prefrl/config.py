@@ -61,7 +61,7 @@ def _component(role: Role, default: str | None, value: object) -> Settings:
     try:
         return cls.model_validate(value)
     except ValidationError as error:
-        raise ConfigError("\n".join(_explained(cls, error.errors()))) from None
+        raise ConfigError("\n".join(explained(cls, error.errors()))) from None
 
 
 class Config(Settings):
@@ -101,21 +101,21 @@ class Config(Settings):
 
         Raises `ConfigError` with a line for each mistake: where, what was expected, what came, the nearest name.
         """
-        data = _read(source)
+        data = read_settings(source)
         for override in _kinds_first(overrides):
             _apply(data, override)
         try:
             return cls.parse(data)
         except ConfigError as error:
             given = [override.partition("=")[0].split(".") for override in overrides]
-            raise ConfigError("\n".join(_placed(line, source, given) for line in str(error).splitlines())) from None
+            raise ConfigError("\n".join(placed(line, source, given) for line in str(error).splitlines())) from None
 
     @classmethod
     def reopen(cls, path: Path, overrides: Sequence[str] = ()) -> Config:
         """Read what a run or a reward model was saved with, by this version or an earlier one, with overrides."""
         if not path.is_file():
             raise ConfigError(f"{path.parent} holds no run: expected a file {path.name} in it")
-        data = _read(path)
+        data = read_settings(path)
         for part, role in ROLES.items():
             if isinstance(data.get(part), dict):
                 data[part] = todays(role, data[part])
@@ -129,7 +129,7 @@ class Config(Settings):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            lines = [line for told in _explained(cls, error.errors()) for line in told.splitlines()]
+            lines = [line for told in explained(cls, error.errors()) for line in told.splitlines()]
             raise ConfigError("\n".join(line.removeprefix(".") for line in lines)) from None
 
     def dump(self) -> str:
@@ -201,7 +201,7 @@ def _first_comment(file: Traversable) -> str:
     return file.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
 
 
-def _read(source: str | Path) -> Json:
+def read_settings(source: str | Path) -> Json:
     """The settings in a file, or in a preset of that name."""
     path = Path(source)
     if path.is_file():
@@ -226,7 +226,7 @@ def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
     return f"{source}, line {mark.line + 1}" if mark else str(source)
 
 
-def _placed(line: str, source: str | Path, given: Sequence[list[str]]) -> str:
+def placed(line: str, source: str | Path, given: Sequence[list[str]]) -> str:
     """What is said of a setting, with the line of the file that has it; unless an override has to do with it."""
     path = Path(source)
     names = line.partition(":")[0].split(".")
@@ -277,7 +277,7 @@ def _apply(data: Json, override: str) -> None:
     data[last] = value
 
 
-def _explained(cls: type[Settings], errors: Iterable[ErrorDetails]) -> list[str]:
+def explained(cls: type[Settings], errors: Iterable[ErrorDetails]) -> list[str]:
     """What `_explain` says of each mistake; for a setting of several types pydantic names each, here in one line."""
     found: dict[tuple[int | str, ...], list[ErrorDetails]] = {}
     for error in errors:

@@ -26,7 +26,7 @@ from prefrl.seeding import to_host, to_numpy
 from prefrl.types import C, Fitted, Floats, Json, Query, Round
 
 
-class RanksError(RuntimeError):
+class RanksError(ValueError):
     """Ranks that should have the same parameters do not."""
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from prefrl.components import Settings
+from prefrl.components import Settings, resume_command
 from prefrl.config import Config
 from prefrl.envs.fast.watched import EnvironmentFault
 from prefrl.evaluate.drift import first_judged, read_probes
@@ -108,7 +108,9 @@ class Run:
         if not checkpoints(self.folder):
             return f"no round was finished: nothing is lost in {self.folder}"
         folder, _ = _newest(self.folder)
-        return f"the last good checkpoint is {folder}; once that is dealt with, go on with: prefrl resume {self.folder}"
+        return (
+            f"the last good checkpoint is {folder}; once that is dealt with, go on with: {resume_command(self.folder)}"
+        )
 
     @property
     def summary(self) -> Json:

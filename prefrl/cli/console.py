@@ -18,6 +18,7 @@ from rich.progress import Task as Row
 from rich.table import Table
 from rich.text import Text
 
+from prefrl.components import resume_command
 from prefrl.evaluate.card import ReportCard
 from prefrl.kinds import find, named
 from prefrl.loop import Loop
@@ -107,7 +108,7 @@ def drive(running: Run) -> None:
                         say(f"  {note}", "yellow")
                     check()
         except KeyboardInterrupt:
-            say(f"stopped; nothing that was labelled is lost. Go on with: prefrl resume {running.folder}")
+            say(f"stopped; nothing that was labelled is lost. Go on with: {resume_command(running.folder)}")
             raise
         console.print(summary_table(running.summary))
         say(f"report: {running.report()}")

@@ -93,7 +93,7 @@ def run(
         drive_all(over_seeds(source, overrides, seeds), out or _new_folder(source), jobs, "local")
         return
     if dry_run:
-        _dry_run(config)
+        _dry_run(config, seeds)
         return
     with on(ranks) as here:
         if here and out is None:
@@ -406,12 +406,12 @@ def _load(source: str, overrides: list[str] | None) -> Config:
     return Config.load(source, changes)
 
 
-def _dry_run(config: Config) -> None:
+def _dry_run(config: Config, seeds: int) -> None:
     from prefrl.cli.console import duration, say
     from prefrl.stages import estimate
 
-    seconds = estimate(config)
-    say(f"everything builds and one small round runs; the whole would take about {duration(seconds)}")
+    seconds, whole = estimate(config), "the whole" if seeds == 1 else "each of the runs"
+    say(f"everything builds and one small round runs; {whole} would take about {duration(seconds)}")
 
 
 def main() -> None:

@@ -7,16 +7,9 @@ from importlib.resources import files
 from typing import Any
 
 from prefrl.components import TABLE, Role, Settings, plugins, settings_class
-from prefrl.config import Config
+from prefrl.config import ROLES, Config
 from prefrl.types import Json
 
-ROLES: dict[str, Role] = {
-    "task": "tasks",
-    "labeler": "labelers",
-    "select": "selectors",
-    "reward": "rewards",
-    "learner": "learners",
-}
 REQUIRED = ["task", "reward", "learner"]
 
 

@@ -26,11 +26,10 @@ from prefrl.distributed import each_tensor, world
 from prefrl.improve.gradient import Batch, adam_of, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
-from prefrl.policies.acting import Acting, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
+from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
 from prefrl.policies.cnn import CNNPolicySettings
 from prefrl.policies.divided import environments, of_all
 from prefrl.policies.gru import GRUPolicySettings
-from prefrl.policies.loaded import Actor
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, step_rewards

@@ -25,8 +25,7 @@ from prefrl.improve.gradient import adam_of, descend_by_logp
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import Player
 from prefrl.kinds import kind_of
-from prefrl.policies.acting import Decisions
-from prefrl.policies.loaded import Actor
+from prefrl.policies.acting import Actor, Decisions
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask, Recorded, RewardModel, Store

@@ -27,8 +27,7 @@ from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
 from prefrl.improve.replay import cut, load_replay, relabel, replay_state
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
-from prefrl.policies.acting import Acting, Memory
-from prefrl.policies.loaded import Actor
+from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
@@ -326,14 +325,7 @@ class SB3:
 
     def _act(self, deterministic: bool) -> Act:
         """In episodes that are yet to begin."""
-
-        def decide(
-            observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
-        ) -> tuple[Floats, Floats, Memory]:
-            actions, memory = self._chosen(observations, memory, deterministic)
-            return actions, actions, memory
-
-        return Acting(decide, None)
+        return played(lambda observations, _, memory: self._chosen(observations, memory, deterministic), None)
 
     def _chosen(self, observations: Floats, memory: Memory, deterministic: bool) -> tuple[Floats, Memory]:
         """(n, O) and (n, M) -> (n, A) actions to execute, and what is remembered now, if anything."""

@@ -7,6 +7,7 @@ that is trained); one without reads single steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias
 
@@ -72,6 +73,11 @@ class ControlPolicy(Policy[I], Protocol[I]):
         """Raises ValueError where shapes differ."""
 
 
+Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[Floats, Memory]]
+"""(n, O) observations and what is remembered of each episode -> (n, A) actions to execute, and what is remembered now:
+the policy's mode, or drawn where there is a generator."""
+
+
 class Acting:
     """An `Act` of a policy, with what it remembers of the episodes that it is in."""
 
@@ -83,6 +89,18 @@ class Acting:
         self.memory = forgotten(self.memory, begins)
         choices, actions, self.memory = self._decide(observations, self._rng, legal, self.memory)
         return choices, actions
+
+
+def played(actor: Actor, rng: np.random.Generator | None) -> Acting:
+    """An actor in episodes that are yet to begin; its actions are its choices."""
+
+    def decide(
+        observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
+    ) -> tuple[Floats, Floats, Memory]:
+        actions, memory = actor(observations, rng, memory)
+        return actions, actions, memory
+
+    return Acting(decide, rng)
 
 
 def forgotten(memory: Memory, begins: Bools) -> Memory:

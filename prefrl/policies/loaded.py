@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from prefrl.components import ConfigError
-from prefrl.policies.acting import Acting, Memory, forgotten
+from prefrl.policies.acting import Actor, Memory, forgotten, played
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask
-from prefrl.types import Bools, Floats
-
-Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[Floats, Memory]]
-"""(n, O) observations and what is remembered of each episode -> (n, A) actions to execute, and what is remembered now:
-the policy's mode, or drawn where there is a generator."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +25,7 @@ class Loaded:
 
     def act(self, rng: np.random.Generator | None) -> Act:
         """For rollouts: what is drawn from `rng`, or the policy's mode; in episodes that are yet to begin."""
-
-        def decide(
-            observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
-        ) -> tuple[Floats, Floats, Memory]:
-            actions, memory = self.actor(observations, rng, memory)
-            return actions, actions, memory
-
-        return Acting(decide, rng)
+        return played(self.actor, rng)
 
     def check(self, task: ControlTask, name: str) -> None:
         """Raises `ConfigError` for a task of other spaces; `name` says whose policy this is."""

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from prefrl.report import plots
 from prefrl.report.chapters import Card
-from prefrl.report.groups import Contest, Group, Seen, contests, ended, found_in, unfinished
+from prefrl.report.groups import Contest, Group, Seen, contests, ended, found_in, left_out
 from prefrl.report.plots import Line, Strip
 from prefrl.report.report import page
 from prefrl.report.words import show_count, show_number, show_share, show_time
@@ -60,8 +60,8 @@ def compare(paths: Sequence[Path]) -> tuple[list[Contest], list[str]]:
     runs = found_in(paths)
     found = contests(runs)
     if not found:
-        raise ValueError("none of the runs is finished: " + "; ".join(unfinished(runs)))
-    return found, unfinished(runs)
+        raise ValueError("none of the runs is finished: " + "; ".join(left_out(runs, found)))
+    return found, left_out(runs, found)
 
 
 def write_comparison(paths: Sequence[Path], to: Path) -> tuple[list[Contest], list[str]]:
@@ -72,22 +72,22 @@ def write_comparison(paths: Sequence[Path], to: Path) -> tuple[list[Contest], li
     forms = {".html": _page, ".md": markdown, ".json": _numbers}
     if to.suffix not in forms:
         raise ValueError(f"{to}: expected a name that ends in .html, .md or .json")
-    found, left_out = compare(paths)
-    write_file(to, forms[to.suffix](found, left_out).encode())
-    return found, left_out
+    found, others = compare(paths)
+    write_file(to, forms[to.suffix](found, others).encode())
+    return found, others
 
 
-def _page(found: Sequence[Contest], left_out: Sequence[str]) -> str:
+def _page(found: Sequence[Contest], others: Sequence[str]) -> str:
     runs = sum(len(group.runs) for contest in found for group in contest.groups)
     return page(
         "comparison.html",
         sections=[_section(contest, f"task{at}") for at, contest in enumerate(found)],
-        left_out=left_out,
+        left_out=others,
         runs=runs,
     )
 
 
-def markdown(found: Sequence[Contest], left_out: Sequence[str] = ()) -> str:
+def markdown(found: Sequence[Contest], others: Sequence[str] = ()) -> str:
     """A table for each task, with the seeds and the versions that made it."""
     blocks = []
     for contest in found:
@@ -96,10 +96,10 @@ def markdown(found: Sequence[Contest], left_out: Sequence[str] = ()) -> str:
         lines = [heads, ["---"] * len(heads), *([row.name, *row.columns.values()] for row in rows)]
         cells = ("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
         blocks.append("\n".join([f"**{contest.task}**, seeds {_seeds(contest)}; {_versions(contest)}", "", *cells]))
-    return "\n\n".join([*blocks, *left_out]) + "\n"
+    return "\n\n".join([*blocks, *others]) + "\n"
 
 
-def _numbers(found: Sequence[Contest], left_out: Sequence[str]) -> str:
+def _numbers(found: Sequence[Contest], others: Sequence[str]) -> str:
     groups: list[Json] = [
         {
             "task": contest.task,
@@ -115,7 +115,7 @@ def _numbers(found: Sequence[Contest], left_out: Sequence[str]) -> str:
         for contest in found
         for group in contest.groups
     ]
-    return json.dumps({"groups": groups, "left_out": list(left_out)}, indent=1)
+    return json.dumps({"groups": groups, "left_out": list(others)}, indent=1)
 
 
 def rows_of(contest: Contest) -> list[Row]:

@@ -120,10 +120,10 @@ def contests(runs: Sequence[Seen]) -> list[Contest]:
     found = []
     for task in dict.fromkeys(run.facts.task for run in runs):
         kept = [run for run in runs if run.facts.task == task and run.facts.finished]
-        alike: dict[str, list[Seen]] = {}
+        alike: dict[str, dict[int, Seen]] = {}  # by settings, then by seed: a second run of both would tell nothing new
         for run in kept:
-            alike.setdefault(repr(sorted(run.settings.items())), []).append(run)
-        groups = [tuple(sorted(group, key=lambda run: run.seed)) for group in alike.values()]
+            alike.setdefault(repr(sorted(run.settings.items())), {}).setdefault(run.seed, run)
+        groups = [tuple(sorted(group.values(), key=lambda run: run.seed)) for group in alike.values()]
         if groups:
             by_gold = any(run.facts.gold[0] is not None or run.facts.gold[1] is not None for run in kept)
             made = (Group(name, group, by_gold) for name, group in zip(_names(groups), groups, strict=True))
@@ -177,15 +177,15 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-def unfinished(runs: Sequence[Seen]) -> list[str]:
-    """A line for each run that is left out."""
-    lost = [
-        f"{run.folder}: it has no score, its last gold is not a number"
-        for run in runs
-        if run.facts.finished and ended(run.facts, True) is None and ended(run.facts, False) is None
-    ]
-    return lost + [
-        f"{run.folder}: not finished, round {run.facts.rounds} of {run.facts.planned or '?'}"
-        for run in runs
-        if not run.facts.finished
-    ]
+def left_out(runs: Sequence[Seen], found: Sequence[Contest]) -> list[str]:
+    """A line for each run that does not count, and why."""
+    counted = {run.folder: contest for contest in found for group in contest.groups for run in group.runs}
+    lines = []
+    for run in runs:
+        if not run.facts.finished:
+            lines.append(f"{run.folder}: not finished, round {run.facts.rounds} of {run.facts.planned or '?'}")
+        elif run.folder not in counted:
+            lines.append(f"{run.folder}: another run has the same settings and seed")
+        elif ended(run.facts, counted[run.folder].by_gold) is None:
+            lines.append(f"{run.folder}: it has no score, its last gold is not a number")
+    return lines

@@ -12,7 +12,7 @@ import yaml
 from pydantic import Field, ValidationError, field_validator
 
 from prefrl.components import ConfigError, Settings
-from prefrl.config import Config
+from prefrl.config import Config, explained, placed, read_settings
 
 
 class Member(NamedTuple):
@@ -51,12 +51,9 @@ class SweepPlan(Settings):
     def load(cls, path: Path) -> SweepPlan:
         """Read a YAML file. Raises `ConfigError`."""
         try:
-            data = yaml.safe_load(path.read_text(encoding="utf-8"))
-            return cls.model_validate(data)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path}: not valid YAML: {error}") from None
+            return cls.model_validate(read_settings(path))
         except ValidationError as error:
-            lines = (f"{path}: {'.'.join(map(str, e['loc'])) or 'all of it'}: {e['msg']}" for e in error.errors())
+            lines = (placed(line.removeprefix("."), path, ()) for line in explained(cls, error.errors()))
             raise ConfigError("\n".join(lines)) from None
 
     def members(self) -> list[Member]:

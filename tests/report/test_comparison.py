@@ -40,6 +40,13 @@ def test_who_always_loses_has_no_chance_and_the_page_says_so(two_rates: Path, tm
     assert "0.00 (0.00 to 0.00)" in (tmp_path / "page.html").read_text()
 
 
+def test_a_second_run_with_the_same_settings_and_seed_does_not_count(two_rates: Path) -> None:
+    again = folder_of_run(two_rates / "slow-again", [-10.0, -8.0, -6.0], settings(0, 0.1))
+    (contest,), others = compare([two_rates])
+    assert [len(group.runs) for group in contest.groups] == [4, 4]
+    assert others == [f"{again}: another run has the same settings and seed"]
+
+
 def test_a_run_whose_last_gold_is_lost_is_named_and_gold_stays_the_measure(two_rates: Path) -> None:
     lost = folder_of_run(two_rates / "slow-9", [-10.0, -8.0, None], settings(9, 0.1))
     (contest,), left_out = compare([two_rates])
