@@ -84,7 +84,9 @@ def test_what_is_finished_is_not_run_again_and_what_failed_is(tmp_path: Path) ->
     first, again = Pretend(failing="control-toy/seed-1"), Pretend()
     ended = list(Sweep(plan, tmp_path).run(first, 2))
     assert sorted((e.folder.name, e.status) for e in ended) == [("seed-0", 0), ("seed-1", 2), ("seed-2", 0)]
-    list(Sweep(plan, tmp_path).run(again, 2))
+    sweep = Sweep(plan, tmp_path)
+    assert [job.folder.name for job in sweep.jobs] == ["seed-1"]
+    list(sweep.run(again, 2))
     assert again.called == ["control-toy/seed-1"]
 
 
