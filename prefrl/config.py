@@ -30,6 +30,7 @@ from prefrl.protocols import (
     TaskSettings,
     Threaded,
 )
+from prefrl.report.trackers import Places
 from prefrl.seeding import device_of, streams
 from prefrl.types import Json
 
@@ -87,6 +88,9 @@ class Config(Settings):
     """How often, and how much is asked."""
     goal: str = Field("", max_length=200)
     """What people and judges are asked, unless the labeler has a question of its own."""
+    track: Places = ()
+    """Trackers that show the metrics beside TensorBoard: wandb, mlflow, trackio, each with its project as in
+    wandb:hoppers if you like. They may send them over the network."""
     seed: int = Field(0, ge=0)
     """All random numbers of the run come from this one."""
 

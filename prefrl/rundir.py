@@ -9,11 +9,10 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from prefrl.components import Settings, resume_command
+from prefrl.components import Settings, flat, resume_command
 from prefrl.config import Config
 from prefrl.envs.fast.watched import EnvironmentFault
 from prefrl.evaluate.drift import first_judged, read_probes
@@ -26,6 +25,7 @@ from prefrl.protocols import Attended, Noted, RewardModel, Task
 from prefrl.ranks import lead, rounds, shared
 from prefrl.report.examples import save_examples
 from prefrl.report.report import write_report
+from prefrl.report.trackers import Trackers
 from prefrl.seeding import streams
 from prefrl.storage.checkpoints import checkpoints, load_state, newest, save_state
 from prefrl.storage.files import DamagedError, verify, whole_folder, write_file
@@ -64,7 +64,7 @@ class Run:
             self._start_from(reward)
             self._rows = self._restore()
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
-            self._events = _events(self.folder, self.loop.round)
+            self._trackers = Trackers(self.folder, config.model_dump(mode="json"), config.track, self.loop.round)
             if isinstance(self.loop.labeler, Attended):
                 self.notes += self.loop.labeler.open(self.store)
             lead(config.model_dump(mode="json"), self.loop)
@@ -88,7 +88,7 @@ class Run:
         # The page before the store: its last answers are still to be written.
         if isinstance(self.loop.labeler, Attended):
             self.loop.labeler.close()
-        self._events.close()
+        self._trackers.close()
         self.store.close()
 
     def __iter__(self) -> Iterator[Round]:
@@ -165,8 +165,7 @@ class Run:
         self._save_examples(round)
         if round.evaluated:
             keep(self.folder, round.number, round.evaluated)
-        for name, value in round.metrics.items():
-            self._events.add_scalar(name, value, round.number)
+        self._trackers.log(round.number, round.metrics)
         self._checkpoint(round.number)
 
     def _score_probes(self, number: int) -> None:
@@ -286,7 +285,7 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
 
 
 def _lasting(config: Config) -> Config:
-    parts: Json = {name: part.lasting() for name, part in config if isinstance(part, Settings)}
+    parts: Json = {name: part.lasting() for name, part in config if isinstance(part, Settings)} | {"track": ()}
     if config.labeler.asks_people():  # words to people may get better as a run goes on; a judge's are its settings
         parts["goal"] = ""
     return config.model_copy(update=parts)
@@ -299,17 +298,9 @@ def _hash(saved: Path) -> str:
 
 def _difference(a: Settings, b: Settings) -> str:
     """The first setting in which two groups of settings differ."""
-    flat_a, flat_b = (dict(_flatten(c.model_dump(mode="json"))) for c in (a, b))
+    flat_a, flat_b = (dict(flat(c.model_dump(mode="json"))) for c in (a, b))
     key = next(k for k in [*flat_a, *flat_b] if flat_a.get(k) != flat_b.get(k))
     return f"{key} is {flat_a.get(key)} there, {flat_b.get(key)} here"
-
-
-def _flatten(tree: Json, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _newest(folder: Path) -> tuple[Path, list[str]]:
@@ -318,10 +309,3 @@ def _newest(folder: Path) -> tuple[Path, list[str]]:
         return newest(folder)
     except DamagedError as error:
         raise RunError(str(error)) from error
-
-
-def _events(folder: Path, round: int) -> Any:
-    """TensorBoard's event files, beside the rest."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    return SummaryWriter(str(folder), purge_step=round + 1)  # drops what it holds of rounds that are done again

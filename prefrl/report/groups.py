@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from prefrl.components import flat
 from prefrl.report.facts import Facts, gather
 from prefrl.report.records import Record, mapping, number, read, visible
 from prefrl.stats import aggregates
@@ -20,7 +21,7 @@ from prefrl.types import Floats
 
 SHOWN = 3
 """Settings that a group is named by; where more differ it is named by its folder."""
-APART = ("seed", "labeler.port", "labeler.host", "labeler.clips")
+APART = ("seed", "track", "labeler.port", "labeler.host", "labeler.clips")
 """Settings that may differ within a group."""
 
 
@@ -39,7 +40,7 @@ class Seen:
             tree = yaml.safe_load(self.record.config)
         except yaml.YAMLError:
             tree = None
-        return {name: value for name, value in _flat(mapping(tree)) if name not in APART}
+        return {name: value for name, value in flat(mapping(tree)) if name not in APART}
 
     @property
     def seed(self) -> int:
@@ -167,14 +168,6 @@ def _common(group: tuple[Seen, ...]) -> str:
 
 def _short(value: object) -> str:
     return visible("null" if value is None else str(value).lower() if isinstance(value, bool) else value, 40)
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def left_out(runs: Sequence[Seen], found: Sequence[Contest]) -> list[str]:
