@@ -22,7 +22,7 @@ def test_the_shipped_schema_is_up_to_date() -> None:
     shipped = files("prefrl.configs").joinpath("schema.json").read_text(encoding="utf-8")
     assert shipped == text(), "run: prefrl describe --schema > configs/schema.json"
     assert set(schema()["properties"]) == {
-        "task", "labeler", "select", "reward", "fitting", "learner", "loop", "goal", "seed",
+        "task", "labeler", "select", "reward", "fitting", "learner", "loop", "goal", "track", "seed",
     }  # fmt: skip
 
 
