@@ -68,6 +68,8 @@ class Kind(Generic[C]):
     """Whether a judge can prefer one for its length."""
     stepwise: bool = False
     """Whether there is a reward for each step, so that one can be discounted, and windows can be cropped."""
+    pipelines: tuple[str, str] = ("reinforcement-learning", "reinforcement-learning")
+    """What the Hub calls the job of a reward model, and of a policy."""
     drifts: bool = False
     """Whether its policies start from a model that they may drift from: how far, and whether they stay fluent."""
     cluster: Callable[[C], str] = lambda candidate: candidate.context
@@ -210,6 +212,7 @@ RESPONSES = Kind(
     unit=_response_unit,
     words=lambda one: len(one.text),
     lengthy=True,
+    pipelines=("text-classification", "text-generation"),
     drifts=True,
     half=lambda one: replace(one, tokens=one.tokens[: max(1, len(one.tokens) // 2)]),
     shown=lambda body: Shown(body["prompt"], body["text"]),

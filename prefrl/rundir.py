@@ -15,6 +15,7 @@ import numpy as np
 from prefrl.components import Settings, flat, resume_command
 from prefrl.config import Config
 from prefrl.envs.fast.watched import EnvironmentFault
+from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
@@ -233,12 +234,16 @@ def open_saved(path: str | Path) -> Saved:
     return Saved(saved_config(folder), folder)
 
 
-def save_reward(folder: Path, config: Config, reward: RewardModel, fitted: Fitted | None = None) -> None:
-    """Write a reward model with the settings that can build it again, and what its fit came to (`fit.json`)."""
+def save_reward(
+    folder: Path, config: Config, reward: RewardModel, fitted: Fitted | None = None, card: ReportCard | None = None
+) -> None:
+    """Write a reward model with the settings that can build it again, what its fit came to (`fit.json`), and how good
+    it is (`card.json`)."""
     with whole_folder(folder) as work:
         if fitted is not None:
-            metrics = {f"fit/{k}": v if math.isfinite(v) else None for k, v in fitted.metrics.items()}
-            write_file(work / "fit.json", json.dumps(metrics, indent=1).encode())
+            write_file(work / "fit.json", json.dumps(fitted.row(), indent=1).encode())
+        if card is not None:
+            write_file(work / "card.json", card.model_dump_json(indent=1).encode())
         save_state(work, "reward", reward.state())
         write_file(work / "config.yaml", config.dump().encode())
 
@@ -286,7 +291,8 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
 
 def _lasting(config: Config) -> Config:
     parts: Json = {name: part.lasting() for name, part in config if isinstance(part, Settings)} | {"track": ()}
-    if config.labeler.asks_people():  # words to people may get better as a run goes on; a judge's are its settings
+    asker = config.labeler  # words to people may get better as a run goes on; a judge's are its settings
+    if asker.asks_people() or asker.asking(config.goal) == asker:
         parts["goal"] = ""
     return config.model_copy(update=parts)
 

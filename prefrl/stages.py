@@ -16,7 +16,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.config import Config
 from prefrl.evaluate.best_of_n import best
 from prefrl.evaluate.card import ReportCard
-from prefrl.evaluate.grade import Subject, grade, habits, judgements, of_run
+from prefrl.evaluate.grade import Subject, grade, of_judgements, of_run
 from prefrl.evaluate.summary import read_metrics
 from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
@@ -26,6 +26,7 @@ from prefrl.kinds import only
 from prefrl.policies.loaded import Loaded
 from prefrl.policies.zips import Zipped, read_zip
 from prefrl.protocols import Acts, Attended, ControlTask, Labeler, RewardModel, Settles, TextTask, control, text
+from prefrl.report.hub import write_readme
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, Saved, open_saved, save_reward, saved_config
 from prefrl.sample.graded import graded
@@ -170,7 +171,11 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
             )
         reward = config.build_reward(task, rng.build)
         fitted = fit(reward, store, config.fitting, rng.fit)
-    save_reward(out, config, reward, fitted)
+        names = (out.resolve().name, source.name)
+        subject = of_judgements(reward, store, names, config.fitting, [fitted.row()], config.discount, held_out=True)
+        card = grade(subject, rng.evaluate) if subject is not None and len(fitted.predicted) else None
+    save_reward(out, config, reward, fitted, card)
+    write_readme(out, out, "reward", task.kind)
     return fitted, notes
 
 
@@ -422,12 +427,8 @@ def report_card(
             round = json.loads((saved.folder / "loop.json").read_text())["round"]
             subject = of_run(reward, store, model, round, fitting, discount)
         else:
-            judged, names = (
-                judgements(store, fitting.held_out if held_out else None),
-                (model.resolve().name, source.name),
-            )
-            known = habits(fitting, _fits(model))
-            subject = Subject(reward, judged, (), discount, *names, held_out, habits=known) if judged else None
+            names = (model.resolve().name, source.name)
+            subject = of_judgements(reward, store, names, fitting, _fits(model), discount, held_out)
         if subject is None:
             raise RunError(f"{source}: no judgement is held out that the reward model could be graded on")
         if rewardbench is not None:

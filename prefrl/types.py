@@ -180,6 +180,10 @@ class Fitted:
     preference: Floats
     """(M,) what was judged there."""
 
+    def row(self) -> Json:
+        """The metrics as a line of `metrics.jsonl` has them; what is not finite is None."""
+        return {f"fit/{name}": value if math.isfinite(value) else None for name, value in self.metrics.items()}
+
 
 @dataclass(frozen=True)
 class Round(Generic[C]):

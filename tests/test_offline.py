@@ -13,6 +13,7 @@ import yaml
 from prefrl import Config
 from prefrl.config import presets
 from prefrl.envs.texts import Texts, TextsSettings
+from prefrl.evaluate.card import ReportCard
 from prefrl.exchange.layout import Which
 from prefrl.exchange.source import open_judgements
 from prefrl.fit.trainer import NothingToFit
@@ -62,6 +63,9 @@ def test_a_file_of_segment_pairs_fits_what_the_chosen_labeler_said(tmp_path: Pat
     assert human.metrics["comparisons"] == script.metrics["comparisons"] == 60
     assert human.metrics["accuracy_held_out"] > 0.9
     assert "60 x label by a script" in notes[0]
+    graded = ReportCard.model_validate_json((tmp_path / "human/card.json").read_bytes())
+    assert graded.accuracy.value == human.metrics["accuracy_held_out"]
+    assert f"of {graded.about.comparisons} held-out comparisons" in (tmp_path / "human/README.md").read_text()
     ask = [Segment(np.full((5, 2), (x, 0), np.float32), np.zeros((5, 2), np.float32), str(x), 0) for x in (-2, 2)]
     for name, sign in (("human", 1), ("script", -1)):
         low, high = saved(tmp_path / name).score(ask)

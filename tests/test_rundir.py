@@ -9,7 +9,7 @@ from runs import copied, exit_code, finish, tiny
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.rundir import Run, RunError, open_saved, save_reward
+from prefrl.rundir import Run, RunError, _lasting, open_saved, save_reward
 from prefrl.stages import label, with_reward
 from prefrl.storage.checkpoints import load_state
 from prefrl.storage.files import DamagedError
@@ -70,6 +70,12 @@ def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(
     assert weights(tmp_path / "parts") == weights(finished_tiny[name])
     assert numbers(tmp_path / "parts") == numbers(finished_tiny[name])
     assert (tmp_path / "parts/probes.jsonl").read_bytes() == (finished_tiny[name] / "probes.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(("labeler", "matters"), [("oracle", False), ("terminal", False), ("judge", True)])
+def test_the_words_of_the_goal_are_a_setting_only_where_a_model_reads_them(labeler: str, matters: bool) -> None:
+    old, new = (tiny("text/toy", f"labeler.kind={labeler}", f"goal={goal}") for goal in ("''", "Which is kinder?"))
+    assert (_lasting(old) != _lasting(new)) is matters
 
 
 DYING = """

@@ -66,6 +66,10 @@ class Rows(StrEnum):
     arena = "arena"
 
 
+MODELS = {Form.classifier: "text", Form.policy: "text", Form.adapter: "text", Form.sb3: "control", Form.onnx: "control"}
+"""The forms that are models, and the kind of their candidates."""
+
+
 @commands.command("export")
 def export_(
     store: Annotated[
@@ -88,29 +92,8 @@ def export_(
 
     if to.is_file() and not force:
         raise ValueError(f"{to} is there already: choose another name, or write over it with --force")
-    if form is Form.classifier:
-        from prefrl.stages import export_classifier
-
-        say(f"{to}: its logit, shifted by {export_classifier(store, to):+.6g}, is the mean of the reward's members")
-        return
-    if form in (Form.policy, Form.adapter):
-        from prefrl.stages import policy_of
-
-        policy_of(store).save(to, adapter=form is Form.adapter)
-        loads = "PeftModel.from_pretrained" if form is Form.adapter else "AutoModelForCausalLM.from_pretrained"
-        say(f"{to}: the newest policy, with its tokenizer; {loads} reads it")
-        return
-    if form is Form.sb3:
-        from prefrl.stages import export_sb3
-
-        round = export_sb3(store, to, best)
-        say(f"{to}: the policy after round {round}; stable-baselines3 loads it, and it acts on raw observations")
-        return
-    if form is Form.onnx:
-        from prefrl.stages import export_onnx
-
-        export_onnx(store, to, best)
-        say(f"{to}: raw observations (n, O) in, actions out: the policy's mode")
+    if form in MODELS:
+        say(_export_model(store, to, form, best))
         return
     from prefrl.exchange.ports import export
     from prefrl.store import Store
@@ -124,6 +107,29 @@ def export_(
     if not done.written:
         raise ValueError(f"{store} holds nothing that {form.value} can say: {to} is empty")
     say(f"{done.written} written to {to}")
+
+
+def _export_model(source: Path, to: Path, form: Form, best: bool) -> str:
+    """Write a model and the README that goes with it; returns what to say of it."""
+    from prefrl import stages
+    from prefrl.report.hub import write_readme
+
+    if form is Form.classifier:
+        shift = stages.export_classifier(source, to)
+        said = f"its logit, shifted by {shift:+.6g}, is the mean of the reward's members"
+    elif form is Form.sb3:
+        round = stages.export_sb3(source, to, best)
+        said = f"the policy after round {round}; stable-baselines3 loads it, and it acts on raw observations"
+    elif form is Form.onnx:
+        stages.export_onnx(source, to, best)
+        said = "raw observations (n, O) in, actions out: the policy's mode"
+    else:
+        stages.policy_of(source).save(to, adapter=form is Form.adapter)
+        loads = "PeftModel.from_pretrained" if form is Form.adapter else "AutoModelForCausalLM.from_pretrained"
+        said = f"the newest policy, with its tokenizer; {loads} reads it"
+    if source.is_dir():
+        write_readme(source, to, form.value, MODELS[form], best)
+    return f"{to}: {said}"
 
 
 @commands.command("import")

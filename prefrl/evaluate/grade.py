@@ -141,6 +141,25 @@ def of_run(
     )
 
 
+def of_judgements(
+    reward: RewardModel,
+    store: Judgements,
+    names: tuple[str, str],
+    fitting: FittingSettings,
+    rows: Sequence[Fields],
+    discount: float,
+    held_out: bool,
+) -> Subject | None:
+    """A reward model on judgements from anywhere, `held_out` on those alone that a fit on them leaves out.
+
+    `names`: of the model and of the data. `rows`: what its fits came to. None where there is nothing to grade on.
+    """
+    judged = judgements(store, fitting.held_out if held_out else None)
+    if not judged:
+        return None
+    return Subject(reward, judged, (), discount, *names, held_out, habits=habits(fitting, rows))
+
+
 def judgements(store: Judgements, held_out: float | None = None, upto: int | None = None) -> list[Judged]:
     """What was judged in a store, with the gold that lies there; only what a fit left out, where a share is given."""
     judged = store.judged(upto)

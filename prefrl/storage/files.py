@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 MANIFEST = "MANIFEST.json"
+README = "README.md"
+"""For people, who may edit it: no manifest vouches for it."""
 
 
 class DamagedError(ValueError):
@@ -66,7 +68,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     work.mkdir()
     try:
         yield work
-        files = sorted(p for p in work.rglob("*") if p.is_file())
+        files = sorted(p for p in work.rglob("*") if p.is_file() and p != work / README)
         hashes = {p.relative_to(work).as_posix(): _sha256(p) for p in files}
         # The manifest comes last: what has one is whole.
         write_file(work / MANIFEST, json.dumps(hashes, indent=1).encode())
@@ -89,7 +91,7 @@ def check_free(path: Path) -> None:
         raise ValueError(f"{path} is a file: choose another folder")
     found = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
     try:
-        ours = {MANIFEST, *json.loads((path / MANIFEST).read_text())}
+        ours = {MANIFEST, README, *json.loads((path / MANIFEST).read_text())}
     except (OSError, ValueError):
         ours = set()
     if strangers := sorted(found - ours):

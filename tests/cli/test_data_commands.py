@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from run_folders import folder_of_run
 
 from prefrl.cli.exchange import Form, Rows
 from prefrl.cli.main import main
@@ -38,6 +39,13 @@ def prefrl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 def test_the_commands_know_every_form() -> None:
     assert {form.value for form in Form} == {*EXPORTS, "classifier", "policy", "adapter", "sb3", "onnx"}
     assert {form.value for form in Rows} == {*FORMS, "auto"}
+
+
+def test_a_policy_leaves_with_a_readme(prefrl: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder_of_run(tmp_path / "run", [-1200.0, -180.0], {"task": {"kind": "control"}, "seed": 0})
+    monkeypatch.setattr("prefrl.stages.export_onnx", lambda source, to, best: to.write_bytes(b"a network"))
+    assert prefrl("export run --form onnx --to policy.onnx")[0] == 0
+    assert "Gold rose from −1,200 to −180" in (tmp_path / "policy.onnx.md").read_text()
 
 
 def test_an_export_says_what_it_left_out(prefrl: Command) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from linear_reward import LinearReward, segment
+from linear_reward import LinearReward
+from run_folders import wild_card
 
 from prefrl.evaluate.card import Bucket, ReportCard
 from prefrl.evaluate.grade import Subject, grade
@@ -18,18 +19,10 @@ from prefrl.report.report import render_card, write_report
 from prefrl.stats.estimates import undefined
 from prefrl.types import Query, Response
 
-WILD = "</bdi></td><script>alert(1)</script>\u202e\x1b{{ 7*7 }}"
-
 
 @pytest.fixture
 def card() -> ReportCard:
-    rng, found = np.random.default_rng(0), []
-    for i in range(40):
-        query = Query((segment(rng, 2 * i, steps=5), segment(rng, 2 * i + 1, steps=7)))
-        found.append(Judged(query, Comparison(query.id, float(rng.random() < 0.7), WILD if i % 2 else "ann")))
-    probes = [{"round": i, "scores": rng.normal(size=8).tolist()} for i in (1, 2, 3)]
-    subject = Subject(LinearReward((1.0, -1.0, 0.5), (1.0, 0.0, 0.0)), found, model=WILD, data=WILD, held_out=True)
-    return grade(Subject(**{**vars(subject), "round": 3, "probes": probes}), rng)
+    return wild_card()
 
 
 def test_the_headline_says_what_it_rests_on(card: ReportCard) -> None:

@@ -1,10 +1,20 @@
 """Folders of runs that never ran: what a report and a comparison read of them."""
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from linear_reward import LinearReward, segment
+
+from prefrl.evaluate.card import ReportCard
+from prefrl.evaluate.grade import Subject, grade
+from prefrl.judgements import Comparison, Judged
+from prefrl.types import Query
+
+WILD = "</bdi></td><script>alert(1)</script>\u202e\x1b{{ 7*7 }}"
 
 
 def folder_of_run(
@@ -35,3 +45,15 @@ def folder_of_run(
     }
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder
+
+
+@cache
+def wild_card() -> ReportCard:
+    """A reward model's card after three rounds, with names that no page may believe."""
+    rng, found = np.random.default_rng(0), []
+    for i in range(40):
+        query = Query((segment(rng, 2 * i, steps=5), segment(rng, 2 * i + 1, steps=7)))
+        found.append(Judged(query, Comparison(query.id, float(rng.random() < 0.7), WILD if i % 2 else "ann")))
+    probes = [{"round": i, "scores": rng.normal(size=8).tolist()} for i in (1, 2, 3)]
+    subject = Subject(LinearReward((1.0, -1.0, 0.5), (1.0, 0.0, 0.0)), found, model=WILD, data=WILD, held_out=True)
+    return grade(Subject(**{**vars(subject), "round": 3, "probes": probes}), rng)
