@@ -13,7 +13,8 @@ from runs import copied, made_once
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN_BY_CI = {"make demo", "make test", "source .venv/bin/activate", "pip install 'prefrl[label]'"}
+INSTALL = {"pip install 'prefrl[label]'", "pip install '.[all]'", "source .venv/bin/activate"}
+RUN_BY_CI = {"make demo", "make test", *INSTALL}
 """CI runs these by themselves, before or around the tests."""
 SERVES = re.compile("--serve|labeler.kind=web")
 """Commands that wait for people; the browser's tests answer them."""
