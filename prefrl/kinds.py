@@ -224,7 +224,7 @@ RESPONSES = Kind(
     hints=(
         "Read the prompt, then each response to its end. Judge the responses as answers to that prompt.",
         "Longer is not better by itself, nor is a tidier layout. *As written* shows a text without any layout.",
-        "A response that breaks off is as good as what is there.",
+        "Judge a response that breaks off by what is there.",
     ),
     lease_seconds=600.0,
     looked_at=1000,

@@ -17,27 +17,30 @@ AGREED = "consent:"
 """Before the name of who has agreed, to which version."""
 
 
-ANSWERS = """\
-## How to answer
-
-- **One is better:** choose it, and say by how much if you are asked: *slightly* for a small difference, *much* for one
-  that is plain at first sight.
-- **Several at once:** put the best one first. Those that are equally good can share a place.
-- **Tie:** you compared them, and they are equally good or equally bad.
-- **Can't compare:** there is no sensible answer to the question, or no telling.
-- **Skip:** something is broken, or you would rather not answer. Somebody else gets the question.
-
-Do not ponder: a quick, honest impression is worth more than a clever guess at what others would say. The last answers
-can be taken back.
-"""
+ANSWERS = (
+    (
+        "One is better",
+        "choose it, and say by how much if you are asked: *slightly* for a small difference, *much* for one "
+        "that is plain at first sight.",
+    ),
+    ("Several at once", "put the best one first. Those that are equally good can share a place."),
+    ("Tie", "you compared them, and they are equally good or equally bad."),
+    ("Can't compare", "there is no sensible answer to the question, or no telling."),
+    ("Skip", "something is broken, or you would rather not answer. Somebody else gets the question."),
+)
+ADVICE = (
+    "Do not spend long on one question: your own honest impression is worth more than a guess at what "
+    "others would say. Your last answers can be taken back."
+)
 
 
 def default_guideline(question: str, kind: Kind[Any]) -> str:
     """The guideline of a project that has none of its own, as Markdown: what is asked, how to look, how to answer."""
-    aim = "Only this counts, whatever else may be better or worse."
-    hints = "".join(f"- {hint}\n" for hint in kind.hints)
-    look = f"## How to look\n\n{hints}\n" if hints else ""
-    return f"**{question}**\n\n{aim}\n\n{look}{ANSWERS}"
+    look = [f"- {hint}" for hint in kind.hints]
+    answers = [f"- **{name}:** {meaning}" for name, meaning in ANSWERS]
+    aim = [f"**{question}**", "Only this counts, whatever else may be better or worse."]
+    parts = [*aim, *["## How to look", "\n".join(look)] * bool(look), "## How to answer", "\n".join(answers), ADVICE]
+    return "\n\n".join(parts)
 
 
 def version_of(text: str) -> str:
