@@ -87,6 +87,8 @@ class Kind(Generic[C]):
     shown: Callable[[Fields], Shown] = lambda _: Shown()
     """From its description."""
     question: str = "Which is better?"
+    hints: tuple[str, ...] = ()
+    """How to look at some, for people; a sentence or two each."""
     lease_seconds: float = 120.0
     """After how long without a sign of life a question goes to somebody else."""
     looked_at: int = 250
@@ -169,6 +171,11 @@ SEGMENTS = Kind(
     shows="clip",
     shown=lambda body: Shown(steps=body["steps"]),
     question="Which clip is better?",
+    hints=(
+        "Watch the clips to the end. They play in step; replay them, slow them down or go frame by frame as you like.",
+        "Clips may start from different positions. Judge what is done from there on, not where it begins.",
+        "How smooth or odd a movement looks only matters if the question asks for it.",
+    ),
     exports={"bundle": "", "minari": ""},
     behaviour="episode",
     spent="environment step",
@@ -217,6 +224,11 @@ RESPONSES = Kind(
     half=lambda one: replace(one, tokens=one.tokens[: max(1, len(one.tokens) // 2)]),
     shown=lambda body: Shown(body["prompt"], body["text"]),
     question="Which response is better?",
+    hints=(
+        "Read the prompt, then each response to its end. Judge the responses as answers to that prompt.",
+        "Longer is not better by itself, nor is a tidier layout. *As written* shows a text without any layout.",
+        "Judge a response that breaks off by what is there.",
+    ),
     lease_seconds=600.0,
     looked_at=1000,
     exports={

@@ -132,7 +132,11 @@ def label(
     ] = None,
     terminal: Annotated[bool, typer.Option(help="Short for labeler.kind=terminal.")] = False,
     serve: Annotated[
-        bool, typer.Option(help="Short for labeler.kind=web; of a folder with a store, its open queries are answered.")
+        bool,
+        typer.Option(
+            help="Short for labeler.kind=web; of a folder with a store its open queries are answered, or with --out "
+            "new ones about its policy."
+        ),
     ] = False,
     host: Annotated[str, typer.Option(help="With --serve: labeler.host.")] = "",
     port: Annotated[int | None, typer.Option(help="With --serve: labeler.port.")] = None,
@@ -143,11 +147,11 @@ def label(
     from prefrl.rundir import open_saved
     from prefrl.storage.log import has_store
 
-    there = serve and has_store(Path(source))
+    there = serve and has_store(Path(source)) and out in (None, Path(source))
     _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
     _refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
-    own = there and (out is not None or given is not None or bool(policies))
-    _refuse(own, f"{source} has queries of its own: --out, --given and --policy are for new ones")
+    own = there and (given is not None or bool(policies))
+    _refuse(own, f"{source} has queries of its own: --given and --policy are for new ones; say with --out where to")
     _refuse(bool(policies) and given is not None, "--policy and --given are two sources of candidates: choose one")
     folder = Path(source) if there else out or Path("labels")
     extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(folder / 'clips'))}"] if terminal else []

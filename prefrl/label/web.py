@@ -18,6 +18,7 @@ from prefrl.label.checks import pick_checks
 from prefrl.page import api, static_files
 from prefrl.page.clips.queue import ClipSettings
 from prefrl.page.questions import Policy, Terms
+from prefrl.page.texts import default_guideline
 from prefrl.protocols import DrawnTask, Store, Task
 from prefrl.types import C
 
@@ -67,8 +68,9 @@ class WebSettings(Settings):
     """Whether a preference can be slight, clear or much."""
     strengths: Strengths = Strengths()
     """What these mean as preferences; without a strength the preferred one is taken to be better for certain."""
-    guideline: str = ""
-    """How to judge, shown beside the questions; an admin can change it on the page."""
+    guideline: str | None = None
+    """How to judge, as Markdown, shown before the first question; an admin can change it on the page. Left out, a short
+    one that fits the kind of candidate; "" for none."""
     consent: str = ""
     """What people must agree to before their first question; who agreed to which version, and when, is kept."""
     question: str = ""
@@ -83,8 +85,8 @@ class WebSettings(Settings):
     """The share of questions that are asked of the same person again, with the sides turned round."""
     minimum_watched: float = Field(0.0, ge=0, le=1)
     """The share of each clip that must be seen before an answer."""
-    markdown: bool = False
-    """Whether people may have responses shown as markdown."""
+    markdown: bool = True
+    """Whether Markdown and the turns of a conversation are drawn; each person can still ask for what was written."""
     break_minutes: float = Field(30.0, ge=0)
     """After how long at work a break is suggested; 0 for never."""
     stay_open: bool = False
@@ -105,8 +107,8 @@ class WebSettings(Settings):
 
     @field_validator("guideline", "consent", "question")
     @classmethod
-    def _can_be_sent(cls, text: str) -> str:
-        if any("\ud800" <= c <= "\udfff" for c in text):
+    def _can_be_sent(cls, text: str | None) -> str | None:
+        if any("\ud800" <= c <= "\udfff" for c in text or ""):
             raise ValueError("the text holds half a surrogate pair: expected UTF-8")
         return text
 
@@ -119,9 +121,9 @@ class WebSettings(Settings):
         return self
 
     def lasting(self) -> Self:
-        """Where the page is served may change, when a port is taken say."""
-        place = ("host", "port", "allowed_hosts", "tls_cert", "tls_key")
-        return self.model_copy(update={name: type(self).model_fields[name].default for name in place})
+        """Where the page is served may change, when a port is taken say; what it explains and how it looks as well."""
+        free = ("host", "port", "allowed_hosts", "tls_cert", "tls_key", "markdown", "guideline")
+        return self.model_copy(update={name: type(self).model_fields[name].default for name in free})
 
     def asks_people(self) -> bool:
         return True
@@ -146,6 +148,8 @@ class WebLabeler:
     fixed: bool = False
     """No more questions will come, and all are waited for."""
     _site: Site | None = None
+    _warm: bool = False
+    """Whether the first clips were drawn, or tried."""
     _checked: int = 0
     """How many queries there were when check questions were last chosen."""
 
@@ -164,7 +168,12 @@ class WebLabeler:
         place = Address(settings.host, settings.port, settings.allowed_hosts, settings.tls_cert, settings.tls_key)
         clips = settings.clips if named(self.task.kind).shows == "clip" else None
         self._site = open_site(store, terms_of(settings, self.task, fixed), place, settings.name, clips)
-        return self._site.notes
+        try:
+            late = self._draw_first(self._site)
+        except BaseException:  # Ctrl-C while it waits
+            self.close()
+            raise
+        return [*self._site.notes, *late]
 
     def close(self) -> None:
         """End the page. What was acknowledged is in the store."""
@@ -177,10 +186,29 @@ class WebLabeler:
         if self._site is None:
             return
         self._file_checks(self._site, store, rng)
-        self._site.service.refresh()
+        for note in self._draw_first(self._site):
+            self._print(note)
+        self._site.service.refresh()  # after the drawing: until then nobody is given the new questions
         self._wait(self._site)
         while self.fixed and not self._site.say_goodbye():
             self._wait(self._site)
+
+    def _draw_first(self, site: Site) -> list[str]:
+        """Have the clips of the first questions drawn before anybody looks; what people should know, if they are not.
+
+        Only the first ones are waited for: then the process that draws is there, and a clip takes a moment.
+        """
+        limit, first = self.settings.clips.ahead_seconds, site.undrawn()
+        if site.clips is None or not limit or not first:
+            return []
+        if self._warm:
+            for one in first:
+                site.clips.want(one, soon=True)
+            return []
+        self._warm = True
+        self._print(f"drawing the first {len(first)} clips, for {limit:g} seconds at most")
+        trouble = site.clips.draw(first, limit)
+        return [f"the first clips are not there yet ({trouble}): the page goes on trying"] if trouble else []
 
     def _wait(self, site: Site) -> None:
         """Until nothing is missing; for ever, where a pool stays open."""
@@ -201,7 +229,10 @@ class WebLabeler:
 
     def _tell(self, site: Site, left: int) -> None:
         text = f"waiting for answers to {left} more question{'s' * (left != 1)} at {site.address}"
-        self.console.print(text + site.people_missing(), soft_wrap=True, markup=False)
+        self._print(text + site.people_missing())
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, soft_wrap=True, markup=False)
 
     def _file_checks(self, site: Site, store: Store[C], rng: np.random.Generator) -> None:
         """Choose check questions among the candidates of what is open, as many as will be given."""
@@ -221,10 +252,10 @@ class WebLabeler:
 def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
     """What a project asks and how, from its settings. `fixed`: no more will be asked than the store holds."""
     kind = named(task.kind)
-    clips = kind.shows == "clip"
+    clips, question = kind.shows == "clip", settings.question or kind.question
     page = api.Page(
         title=task.name,
-        question=settings.question or kind.question,
+        question=question,
         kind=kind.name,
         strength=settings.strength,
         markdown=settings.markdown,
@@ -238,7 +269,8 @@ def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
         page=page,
         policy=policy,
         strengths=dict(settings.strengths),
-        guideline=settings.guideline,
+        guideline=default_guideline(question, kind) if settings.guideline is None else settings.guideline,
+        offered=settings.guideline is None,
         consent=settings.consent,
         fps=cast(DrawnTask[Any], task).fps if clips else 0.0,
         fixed=fixed and not settings.stay_open,

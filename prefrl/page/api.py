@@ -140,7 +140,7 @@ class Page(Plain):
     strength: bool
     """Whether a preference can be slight, clear or much."""
     markdown: bool
-    """Whether responses may be shown as (sanitised) markdown when the person says so."""
+    """Whether Markdown and the turns of a conversation are drawn, until a person asks for what was written."""
     minimum_watched: float
     """The share of each clip that must be seen before an answer."""
     break_minutes: float

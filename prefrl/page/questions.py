@@ -119,6 +119,8 @@ class Terms:
     """slight, clear and much as preferences."""
     guideline: str = ""
     """Its text at the beginning."""
+    offered: bool = False
+    """Whether that is the text we ship, which gives way to any other."""
     consent: str = ""
     """What people agree to before their first question; "" for nothing."""
     fps: float = 0.0
@@ -139,7 +141,7 @@ def ignored(terms: Terms, overlap: int, guideline: api.Guideline) -> Iterator[st
             f"labeler.overlap={terms.policy.overlap} is not used: an admin has set {overlap} on the page, and can "
             "change it there"
         )
-    if terms.guideline not in ("", guideline.text):
+    if not terms.offered and terms.guideline not in ("", guideline.text):
         yield (
             f"labeler.guideline is not used: the store has one already (version {guideline.version}), which an admin "
             "can change on the page"

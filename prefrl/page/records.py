@@ -176,6 +176,12 @@ def open_queries(connection: Connection) -> list[str]:
     )
 
 
+def first_queries(connection: Connection, overlap: int, limit: int) -> list[str]:
+    """The ids of open queries in the order in which they are given out; see `Question.key`."""
+    wanted = sql.select(query.c.id).where(query.c.purpose == "label", ~enough(overlap))
+    return list(connection.scalars(wanted.order_by(query.c.batch.desc(), query.c.seq, query.c.id).limit(limit)))
+
+
 def queries_after(connection: Connection, seq: int, limit: int) -> list[tuple[int, str]]:
     """Number and id of the queries that were asked after an event, oldest first; checks not among them."""
     asked = (query.c.seq > seq) & (query.c.purpose == "label")

@@ -20,6 +20,8 @@ from prefrl.store import Store
 
 GOODBYE_SECONDS = 2.5
 """A little longer than a page waits before it asks how things stand."""
+FIRST = 2
+"""Questions whose clips are drawn before anybody asks."""
 SPARING = 50.0
 """Times as long as a look at all questions took is waited before the next."""
 EVERYWHERE = ("0.0.0.0", "::")
@@ -103,6 +105,15 @@ class Site:
         """The ids of questions without any answer but a skip."""
         with self.service.store.log.reading() as connection:
             return records.open_queries(connection)
+
+    def undrawn(self) -> list[str]:
+        """The candidates of the questions that come first whose clips are still to be drawn."""
+        if self.clips is None:
+            return []
+        with self.service.store.log.reading() as connection:
+            queries = records.first_queries(connection, self.service.desk.policy.overlap, FIRST)
+            found = records.candidates(connection, queries)
+        return self.clips.missing([candidate["id"] for query in queries for candidate in found[query]])
 
     def people_missing(self) -> str:
         """Why the people who are there cannot answer everything, if it is so; for people to read."""

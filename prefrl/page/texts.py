@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import uuid
 from dataclasses import dataclass, field
+from typing import Any
 
+from prefrl.kinds import Kind
 from prefrl.page.access import Event
 from prefrl.storage.log import row
 from prefrl.types import Fields
@@ -13,6 +15,32 @@ from prefrl.types import Fields
 TEXT = "consent"
 AGREED = "consent:"
 """Before the name of who has agreed, to which version."""
+
+
+ANSWERS = (
+    (
+        "One is better",
+        "choose it, and say by how much if you are asked: *slightly* for a small difference, *much* for one "
+        "that is plain at first sight.",
+    ),
+    ("Several at once", "put the best one first. Those that are equally good can share a place."),
+    ("Tie", "you compared them, and they are equally good or equally bad."),
+    ("Can't compare", "there is no sensible answer to the question, or no telling."),
+    ("Skip", "something is broken, or you would rather not answer. Somebody else gets the question."),
+)
+ADVICE = (
+    "Do not spend long on one question: your own honest impression is worth more than a guess at what "
+    "others would say. Your last answers can be taken back."
+)
+
+
+def default_guideline(question: str, kind: Kind[Any]) -> str:
+    """The guideline of a project that has none of its own, as Markdown: what is asked, how to look, how to answer."""
+    look = [f"- {hint}" for hint in kind.hints]
+    answers = [f"- **{name}:** {meaning}" for name, meaning in ANSWERS]
+    aim = [f"**{question}**", "Only this counts, whatever else may be better or worse."]
+    parts = [*aim, *["## How to look", "\n".join(look)] * bool(look), "## How to answer", "\n".join(answers), ADVICE]
+    return "\n\n".join(parts)
 
 
 def version_of(text: str) -> str:

@@ -111,7 +111,8 @@ Open: TypeAlias = Callable[..., House]
 @contextmanager
 def serving(folder: Path, kind: str = "text", **settings: Any) -> Iterator[House]:
     """Serve the store of a folder; no check questions and no repeats, unless the test wants them."""
-    chosen: dict[str, Any] = {"port": 0, "check_share": 0.0, "repeat_share": 0.0} | settings
+    quiet = {"guideline": "", "clips": {"ahead_seconds": 0}}
+    chosen: dict[str, Any] = {"port": 0, "check_share": 0.0, "repeat_share": 0.0, **quiet} | settings
     task: Any = POINT.build() if kind == "control" else SimpleNamespace(kind="text", name="short stories")
     with Store[Any](folder) as store:
         labeler = WebLabeler(WebSettings.model_validate(chosen), task)

@@ -21,6 +21,7 @@ LABELS = 90
 def running(tmp_path: Path) -> Any:
     """The command that a person would type, for fewer labels."""
     settings = ["labeler.kind=web", f"labeler.port={free_port()}", "labeler.enough=0.9", "labeler.strength=false"]
+    settings.append('labeler.guideline=""')
     size = ["loop.rounds=2", f"loop.labels={LABELS}", "learner.evaluation_prompts=128"]
     child = Child("run", "text/reviews", *settings, *size, "--out", str(tmp_path / "run"), log=tmp_path / "log")
     yield child

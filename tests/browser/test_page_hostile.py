@@ -48,6 +48,9 @@ def test_a_hostile_corpus_stays_text_wherever_it_is_shown(tmp_path: Path, open_h
     )
     ann = visit(house.link(NAMES[0]))
     ann.test("guideline-read").click()
+    ann.question()
+    untouched(ann)
+    ann.test("toggle-written").click()
     for number in range(len(CORPUS)):
         query = house.query_of(ann.question())
         shown = ann.shown()
@@ -72,8 +75,8 @@ def test_a_hostile_corpus_stays_text_wherever_it_is_shown(tmp_path: Path, open_h
 
 
 def _every_view(ann: Visitor) -> None:
-    """Markdown, differences and invisible characters, on and off."""
-    for one in ("toggle-markdown", "toggle-diff", "toggle-invisible"):
+    """Drawn as Markdown and turns, differences and invisible characters, on and off."""
+    for one in ("toggle-written", "toggle-diff", "toggle-invisible"):
         ann.test(one).click()
         untouched(ann)
         ann.test(one).click()

@@ -79,7 +79,7 @@ def test_help_names_every_key_and_keys_wait_until_it_is_closed(text_house: House
     ann = visit(text_house.link("ann"))
     id = ann.question()
     ann.page.keyboard.press("?")
-    expect(ann.test("help-dialog").locator("dt")).to_have_count(23)
+    expect(ann.test("help-dialog").locator("dt")).to_have_count(24)
     ann.page.keyboard.press("1")
     ann.page.keyboard.press("Escape")
     assert settle(ann) == id

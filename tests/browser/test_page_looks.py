@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browser.house import House, Open, fill, said, serving, texts
+from browser.house import House, Open, fill, said, segment, serving, texts
 from browser.visitor import Visit, Visitor
+
+from prefrl.types import Query
 
 pytestmark = pytest.mark.browser
 
@@ -122,3 +124,37 @@ def test_a_name_without_a_secure_context_is_enough(tmp_path: Path, visit: Visit)
         ann.situation("done")
         ann.saved()
         assert house.spoken() == 3
+
+
+FIRST_SCREEN = """(controls) => {
+  const height = (box) => Math.max(0, Math.min(box.bottom, innerHeight) - Math.max(box.top, 0));
+  const seen = (id) => {
+    const node = document.querySelector(`[data-testid=${id}]`), box = node.getBoundingClientRect();
+    const top = document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2);
+    return height(box) === box.height && node.contains(top);
+  };
+  const share = height(document.querySelector(".stage").getBoundingClientRect()) / innerHeight;
+  const scrolls = document.documentElement.scrollHeight - innerHeight;
+  return {share, hidden: controls.filter((id) => !seen(id)), scrolls};
+}"""
+"""The share of the window that is for what is judged, and which controls cannot be tapped as they stand."""
+UPRIGHT = PHONE | {"viewport": {"width": 390, "height": 844}, "reduced_motion": "reduce"}
+PAIR = ["choose-first", "choose-first-much", "tie", "choose-second-slight", "incomparable", "skip", "undo"]
+ORDER = ["rank-row-0", "rank-row-3", "submit-ranking", "incomparable", "skip", "undo"]
+STORY = "Once upon a time there was a lighthouse in a storm. " * 40
+
+
+@pytest.mark.parametrize("kind", ["text", "control"])
+@pytest.mark.parametrize(("size", "controls"), [(2, PAIR), (4, ORDER)])
+def test_a_phone_shows_what_is_judged_on_half_of_it_and_all_answers_at_once(
+    kind: str, size: int, controls: list[str], tmp_path: Path, open_house: Open, visit: Visit
+) -> None:
+    some = [f"{k} {STORY}" for k in range(size)]
+    queries = [said(STORY, *some)] if kind == "text" else [Query(tuple(segment(k, False) for k in range(size)))]
+    house = open_house(fill(tmp_path / "asked", queries), kind=kind, question="Which one is kept upright better?")
+    ann = visit(house.link("ann"), **UPRIGHT)
+    ann.allowed.append("500")  # these clips cannot be drawn
+    ann.page.wait_for_selector("[data-testid=question]")
+    found = ann.page.evaluate(FIRST_SCREEN, controls)
+    assert found["share"] >= 0.5
+    assert (found["hidden"], found["scrolls"]) == ([], 0)

@@ -102,17 +102,26 @@ def test_a_ranking_that_is_taken_back_stands_as_it_was(house: House, visit: Visi
     assert order(ann) == [0, 3, 1, 2]
 
 
-def test_a_finger_moves_rows_by_their_grip(house: House, visit: Visit) -> None:
+def test_a_finger_moves_a_number_by_its_grip(house: House, visit: Visit) -> None:
     ann = visit(house.link("ann"), viewport={"width": 360, "height": 740}, has_touch=True, is_mobile=True)
     ann.question()
-    row = ann.test("rank-row-3")
-    row.scroll_into_view_if_needed()
     session = ann.context.new_cdp_session(ann.page)
     boxes = [ann.test(f"rank-row-{one}").locator(".rank-grip").bounding_box() for one in (3, 2)]
     assert boxes[0]
     assert boxes[1]
-    (x, y), end = (boxes[0]["x"] + 8, boxes[0]["y"] + boxes[0]["height"] / 2), boxes[1]["y"]
-    for kind, at in (("touchStart", y), ("touchMove", y - 10), ("touchMove", end - 8), ("touchEnd", None)):
-        points = [] if at is None else [{"x": x, "y": at}]
+    (x, y), end = (boxes[0]["x"] + 8, boxes[0]["y"] + boxes[0]["height"] / 2), boxes[1]["x"]
+    for kind, at in (("touchStart", x), ("touchMove", x - 10), ("touchMove", end - 8), ("touchEnd", None)):
+        points = [] if at is None else [{"x": at, "y": y}]
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     assert order(ann) == [0, 1, 3, 2]
+
+
+def test_on_a_phone_a_number_is_tapped_and_moved_by_the_buttons_below(house: House, visit: Visit) -> None:
+    ann = visit(house.link("ann"), viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    ann.question()
+    ann.test("rank-row-3").tap()
+    expect(ann.test("response-3")).to_be_in_viewport()
+    for button in ("rank-up-3", "rank-up-3", "rank-equal-3"):
+        ann.test(button).tap()
+    assert order(ann) == [0, 3, 1, 2]
+    assert ranked(house, ann) == (0, 1, 2, 0)

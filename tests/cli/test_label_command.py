@@ -17,8 +17,8 @@ from prefrl.types import Response
         ("label text/toy --host 0.0.0.0", "--host and --port go with --serve"),
         ("label text/toy --port 0", "--host and --port go with --serve"),
         ("label text/toy --serve --terminal", "--terminal and --serve are two ways"),
-        ("label store --serve --out other", "--out, --given and --policy are for new ones"),
-        ("label store --serve --given given.jsonl", "--out, --given and --policy are for new ones"),
+        ("label store --serve --out other", "store holds neither a run with a checkpoint"),
+        ("label store --serve --given given.jsonl", "--given and --policy are for new ones"),
     ],
 )
 def test_an_option_that_would_be_ignored_is_refused(prefrl: Shell, line: str, message: str) -> None:

@@ -18,7 +18,8 @@ from starlette.testclient import TestClient
 from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
-from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.kinds import named
+from prefrl.label.web import WebLabeler, WebSettings, terms_of
 from prefrl.page import serve
 from prefrl.page.site import Address
 from prefrl.protocols import Attended
@@ -31,10 +32,11 @@ from prefrl.types import Query, Segment
 Come = Callable[[str], httpx.Client]
 SOON = 40.0
 """Seconds in which everything here must have happened, on a machine that does other things too."""
+QUICK: dict[str, Any] = {"port": 0, "clips": {"ahead_seconds": 0}}
 
 
 def labeler(**settings: Any) -> WebLabeler:
-    return WebSettings(port=0, **settings).build(PointSettings().build())
+    return WebSettings.model_validate(QUICK | settings).build(PointSettings().build())
 
 
 @pytest.fixture
@@ -90,6 +92,27 @@ def answer_in_thread(made: WebLabeler, store: Store[Any]) -> threading.Thread:
 
 
 # --- settings ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", ["control/toy", "text/toy"])
+def test_without_a_guideline_people_read_one_that_says_what_is_asked_and_how_to_answer(preset: str) -> None:
+    config = Config.load(preset, ["labeler.kind=web"])
+    task = config.build_task()
+    made: Any = config.build_labeler(task)
+    terms = terms_of(made.settings, task, fixed=True)
+    assert terms.guideline.startswith(f"**{config.goal}**")
+    assert all(one in terms.guideline for one in ("Tie", "Can't compare", "Skip", *named(task.kind).hints))
+    assert terms_of(WebSettings(guideline=""), task, fixed=True).guideline == ""
+    assert terms_of(WebSettings(guideline="Look."), task, fixed=True).guideline == "Look."
+
+
+def test_the_guideline_that_we_ship_gives_way_to_the_stores_own(asked: Store[Segment]) -> None:
+    for settings, text in (({"guideline": "Look."}, "Look."), ({}, "Look."), ({"guideline": ""}, "Look.")):
+        made = labeler(**settings)
+        assert len(made.open(asked)) == 1, "no setting is said to be ignored"
+        assert made._site is not None
+        assert made._site.service.guideline.text == text
+        made.close()
 
 
 @pytest.mark.parametrize(
@@ -212,7 +235,8 @@ def test_a_run_goes_on_at_another_address_and_with_no_other_setting(tmp_path: Pa
     web = ("labeler.kind=web", "labeler.port=0")
     with Run(Config.load("control/toy", web), tmp_path / "run") as run:
         assert run.store.sequence > 0
-    elsewhere = Config.load("control/toy", (*web, "labeler.allowed_hosts=[lab.example.org]"))
+    words = ("labeler.guideline=Look twice.", "labeler.markdown=false")
+    elsewhere = Config.load("control/toy", (*web, *words, "labeler.allowed_hosts=[lab.example.org]"))
     Run(elsewhere, tmp_path / "run").close()
     with Run.resume(tmp_path / "run") as run:
         assert run.config == elsewhere

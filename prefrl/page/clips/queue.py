@@ -39,6 +39,8 @@ class ClipSettings(Settings):
     """How long one clip may take, before the process that draws it is replaced."""
     first_limit_seconds: float = Field(90.0, gt=0)
     """The same for the first clip of a process, which loads the simulator."""
+    ahead_seconds: float = Field(45.0, ge=0)
+    """How long a start waits for the clips of the first questions, so that nobody else does; 0 draws none ahead."""
     cache_bytes: int = Field(2 << 30, gt=0)
     """How much the clips on disk may take; the least lately used go first, and are drawn again when wanted."""
     waiting: int = Field(256, gt=0)
@@ -129,6 +131,25 @@ class Clips:
         if self._exists(candidate) and self._failure(name) is None and self._shelf.find(name) is None:
             with suppress(ClipBusy):
                 self._enqueue(candidate, name, SOON if soon else LATER)
+
+    def missing(self, candidates: Sequence[str]) -> list[str]:
+        """Those whose clips are still to be drawn; what cannot be drawn is not among them."""
+        names = {one: self._name(one, self._format) for one in candidates if self._exists(one)}
+        return [one for one, name in names.items() if self._failure(name) is None and self._shelf.find(name) is None]
+
+    def draw(self, candidates: Sequence[str], seconds: float) -> str:
+        """Have clips drawn now, and wait for them; why there is one missing, or "" once all are there."""
+        until = time.monotonic() + seconds
+        try:
+            jobs = [self._enqueue(one, self._name(one, self._format), LOOKED_AT) for one in candidates]
+            for job in jobs:
+                if reason := job.done.result(max(0.0, until - time.monotonic())):
+                    return reason
+        except TimeoutError:
+            return f"not drawn within {seconds:g} seconds"
+        except ClipBusy as busy:
+            return str(busy)
+        return ""
 
     def retry(self, candidate: str) -> None:
         """Forget that a clip could not be drawn."""

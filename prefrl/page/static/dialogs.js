@@ -26,7 +26,7 @@ const GROUPS = {
   ],
   "help.ranking": ["up", "down", "level", "submit"],
   "help.player": ["play", "replay", "back", "forward", "slower", "faster"],
-  "help.page": ["comment", "guideline", "help"],
+  "help.page": ["written", "comment", "guideline", "help"],
 };
 
 /** All keys, and what the answers mean. */

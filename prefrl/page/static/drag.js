@@ -18,16 +18,21 @@ export function dragging(list, moved) {
   });
 }
 
+/** Along which way the rows stand: on a small screen they are in one line. */
+const DOWN = { at: "clientY", edge: "top", size: "offsetHeight", slide: "translateY" };
+const ALONG = { at: "clientX", edge: "left", size: "offsetWidth", slide: "translateX" };
+
 function follow(list, row, start, moved) {
+  const way = getComputedStyle(list).gridAutoFlow.startsWith("column") ? ALONG : DOWN;
   const from = [...list.children].indexOf(row);
-  const grip = start.clientY - row.getBoundingClientRect().top;
+  const grip = start[way.at] - row.getBoundingClientRect()[way.edge];
   row.classList.add("dragged");
   row.setPointerCapture(start.pointerId);
 
   const move = (event) => {
     row.style.transform = "";
-    makeRoom(list, row, event.clientY);
-    row.style.transform = `translateY(${event.clientY - grip - row.getBoundingClientRect().top}px)`;
+    makeRoom(list, row, event[way.at], way);
+    row.style.transform = `${way.slide}(${event[way.at] - grip - row.getBoundingClientRect()[way.edge]}px)`;
   };
   const end = (event) => {
     row.removeEventListener("pointermove", move);
@@ -44,22 +49,22 @@ function follow(list, row, start, moved) {
 }
 
 /** Neighbours hop over the row, which itself stays in the page: taking it out would lose the pointer. */
-function makeRoom(list, row, y) {
-  const middle = (node) => node.getBoundingClientRect().top + node.offsetHeight / 2;
-  while (row.previousElementSibling && y < middle(row.previousElementSibling)) {
-    hop(row.previousElementSibling, () => row.after(row.previousElementSibling));
+function makeRoom(list, row, place, way) {
+  const middle = (node) => node.getBoundingClientRect()[way.edge] + node[way.size] / 2;
+  while (row.previousElementSibling && place < middle(row.previousElementSibling)) {
+    hop(row.previousElementSibling, way, () => row.after(row.previousElementSibling));
   }
-  while (row.nextElementSibling && y > middle(row.nextElementSibling)) {
-    hop(row.nextElementSibling, () => row.before(row.nextElementSibling));
+  while (row.nextElementSibling && place > middle(row.nextElementSibling)) {
+    hop(row.nextElementSibling, way, () => row.before(row.nextElementSibling));
   }
 }
 
-function hop(node, change) {
-  const before = node.getBoundingClientRect().top;
+function hop(node, way, change) {
+  const before = node.getBoundingClientRect()[way.edge];
   change();
-  const passed = before - node.getBoundingClientRect().top;
+  const passed = before - node.getBoundingClientRect()[way.edge];
   if (!calm())
-    node.animate([{ transform: `translateY(${passed}px)` }, { transform: "none" }], {
+    node.animate([{ transform: `${way.slide}(${passed}px)` }, { transform: "none" }], {
       duration: 140,
       easing: "ease-out",
     });

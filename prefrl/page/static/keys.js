@@ -25,6 +25,7 @@ export const ACTIONS = {
   forward: ["."],
   slower: ["-"],
   faster: ["+", "="],
+  written: ["w"],
   comment: ["c"],
   guideline: ["g"],
   help: ["?"],
@@ -66,6 +67,12 @@ const WRITTEN = "input:not([type=range]):not([type=checkbox]):not([type=radio]),
 const PRESSED = "button, a, summary, input[type=checkbox], input[type=radio]";
 
 const SCROLLED = ".response, .prompt";
+const WIDE = ".wide";
+
+/** A table or code that was only clicked leaves its arrows to the answers. */
+let pointed = false;
+addEventListener("pointerdown", () => (pointed = true), true);
+addEventListener("keydown", (event) => event.key === "Tab" && (pointed = false), true);
 
 function scrolls(panel) {
   return panel !== null && panel.scrollHeight > panel.clientHeight + 1;
@@ -78,6 +85,8 @@ function taken(event) {
   if (target.closest(WRITTEN)) return true;
   if (target.closest("input[type=range]") && event.key.startsWith("Arrow")) return true;
   if (["ArrowUp", "ArrowDown"].includes(event.key) && scrolls(target.closest(SCROLLED))) return true;
+  const wide = pointed ? null : target.closest(WIDE);
+  if (["ArrowLeft", "ArrowRight"].includes(event.key) && wide && wide.scrollWidth > wide.clientWidth + 1) return true;
   return Boolean(target.closest(PRESSED)) && (event.key === " " || event.key === "Enter");
 }
 

@@ -1,43 +1,57 @@
-/** One text in a panel: plain, with hidden characters shown, compared, or as Markdown; long ones a part at a time. */
+/** One text in a panel: drawn, as written, with hidden characters shown, or compared; long ones a part at a time. */
 
 import { el, put } from "./dom.js";
 import { countHidden, revealed } from "./invisible.js";
-import { markdown } from "./markdown.js";
+import { formatted } from "./markdown.js";
 import { t } from "./strings.js";
+import { bubbles, turns } from "./turns.js";
 
 /** Characters shown at first. */
 export const FIRST = 20_000;
-/** Characters of Markdown that are drawn as such. */
+/** Characters that are drawn as Markdown and turns. */
 const DRAWN = 10 * FIRST;
 /** Characters in a block that the browser lays out only when it comes into sight. */
 const BLOCK = 16_000;
 
 const number = new Intl.NumberFormat("en");
 
-/** A text that can be shown in several ways; `show({markdown, invisible, length, runs})` chooses. */
+/** A text that can be shown in several ways; `show({drawn, invisible, length, runs})` chooses. */
 export class LongText {
   #text;
+  #cue;
   #body = el("div", { class: "text-body", dir: "auto" });
   #foot = el("div", { class: "text-foot" });
   #whole = false;
   #way = {};
 
-  constructor(text, props = {}) {
+  /** `cue`: what a conversation says before this text begins. */
+  constructor(text, props = {}, cue = "") {
     this.#text = text;
+    this.#cue = cue;
     this.element = el("div", { class: "long-text", ...props }, this.#body, this.#foot);
   }
 
   show(way) {
     this.#way = way;
     const part = this.#whole ? this.#text : cut(this.#text, FIRST);
-    const rendered = Boolean(way.markdown) && !way.runs && !way.invisible && part.length <= DRAWN;
-    this.#body.classList.toggle("rendered", rendered);
-    put(this.#body, ...this.#nodes(part, { ...way, rendered }));
+    const drawn = way.drawn && !way.runs && !way.invisible && part.length <= DRAWN ? this.#drawn(part) : null;
+    this.#body.classList.toggle("rendered", Boolean(drawn));
+    put(this.#body, ...(drawn ?? this.#nodes(part, way)));
     put(this.#foot, this.#length(way.length), this.#hidden(way), this.#rest(part.length));
     this.#foot.hidden = !this.#foot.childNodes.length;
   }
 
-  #nodes(part, { rendered, invisible, runs }) {
+  /** Turns and Markdown as nodes; null for a text that has neither, which looks best as it was written. */
+  #drawn(part) {
+    const said = turns(this.#cue + part);
+    if (!said || (this.#cue && said.length === 1)) return formatted(part);
+    return bubbles(said, (content) => {
+      const nodes = formatted(content);
+      return el("div", { class: nodes ? "turn-text" : "turn-text written", dir: "auto" }, nodes ?? content);
+    });
+  }
+
+  #nodes(part, { invisible, runs }) {
     if (!this.#text) return [el("p", { class: "empty", text: t("text.empty") })];
     if (runs)
       return runs
@@ -47,7 +61,6 @@ export class LongText {
             : shown(run.text, invisible, false),
         )
         .flat();
-    if (rendered) return markdown(part);
     if (part.length <= FIRST) return shown(part, invisible);
     return blocks(part).map((block) => el("div", { class: "text-block", dir: "auto" }, shown(block, invisible, false)));
   }

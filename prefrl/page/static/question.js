@@ -1,6 +1,6 @@
 /** One question on the page: what is asked, the candidates, and the ways to answer. */
 
-import { el, icon } from "./dom.js";
+import { calm, el, icon, iconButton } from "./dom.js";
 import { cap, listen } from "./keys.js";
 import { Player } from "./player.js";
 import { Ranking } from "./ranking.js";
@@ -23,6 +23,7 @@ export class Question {
   #watch = new Stopwatch();
   #stops = [];
   #player = null;
+  #prompt = null;
   #responses = null;
   #ranking = null;
   #choices = [];
@@ -65,14 +66,15 @@ export class Question {
     const { items, kind } = this.#assignment;
     const film = items.some((item) => item.media.length);
     if (film) this.#player = player ?? new Player(items);
-    else this.#responses = new Responses(items, this.#page);
-    const prompt = promptView(this.#assignment.prompt);
+    else this.#responses = new Responses(items, this.#page, this.#assignment.prompt);
+    const prompt = promptView(this.#assignment.prompt, this.#page);
     if (prompt) this.#stops.push(prompt.close);
+    this.#prompt = prompt;
     const bar = this.#bar(tools);
     this.#choices = bar.buttons;
     const controls = this.#player && transport(this.#player);
     const ranking = this.#pair ? null : this.#rank(items);
-    this.#listen(bar.actions, controls?.actions);
+    this.#listen(bar.actions, controls?.actions, this.#responses?.actions);
     const element = el(
       "article",
       {
@@ -80,7 +82,12 @@ export class Question {
         testid: "question",
         data: { id: this.#assignment.assignment_id, kind, count: String(items.length), ready: "false" },
       },
-      el("h1", { class: "asked", tabindex: "-1", text: this.#page.question }),
+      el(
+        "div",
+        { class: "asked-row" },
+        el("h1", { class: "asked", tabindex: "-1", text: this.#page.question }),
+        this.#responses && view(this.#responses.toolbar),
+      ),
       prompt?.element,
       this.#responses?.toolbar,
       el(
@@ -134,7 +141,12 @@ export class Question {
   #rank(items) {
     const submit = (order, event) =>
       this.#give({ outcome: "ranking", ranking: order.ranks, touched: order.touched }, event);
-    this.#ranking = new Ranking(items, submit, this.#earlier?.ranking, this.#player?.clips);
+    const look = (slot) => {
+      const found = this.element.querySelector(`.slot[data-slot="${slot}"]`);
+      found.scrollIntoView({ block: "nearest", behavior: calm() ? "auto" : "smooth" });
+    };
+    const lent = { clips: this.#player?.clips, look };
+    this.#ranking = new Ranking(items, submit, this.#earlier?.ranking, lent);
     return this.#ranking;
   }
 
@@ -161,6 +173,7 @@ export class Question {
 
   /** Begin to play, once the question is on the page. */
   begin() {
+    this.#prompt?.begin();
     this.#player?.begin();
     this.#player?.ready.then(() => this.#gate());
   }
@@ -209,4 +222,15 @@ export class Question {
     if (!player) return this.#watch.read();
     return { ...this.#watch.read(), replays: player.replays, speed: player.rate, watched: player.watched };
   }
+}
+
+/** On a small screen the ways to show texts wait behind a button. */
+function view(toolbar) {
+  const button = iconButton("eye", t("text.tools"), { testid: "view", "aria-expanded": "false" });
+  button.classList.add("view-button");
+  button.addEventListener("click", () => {
+    const open = toolbar.classList.toggle("open");
+    button.setAttribute("aria-expanded", String(open));
+  });
+  return button;
 }

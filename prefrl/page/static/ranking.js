@@ -72,11 +72,13 @@ export class Ranking {
   );
   #warned = false;
   #submit;
+  #look;
 
-  /** `clips`, where there are any, lend each row a small moving picture. */
-  constructor(items, submit, ranks = null, clips = []) {
+  /** `clips`, where there are any, lend each row a small moving picture; `look(slot)` brings a candidate into sight. */
+  constructor(items, submit, ranks = null, { clips = [], look = () => {} } = {}) {
     this.order = new Order(items.length, ranks);
     this.#submit = submit;
+    this.#look = look;
     items.forEach((item) => this.#rows.set(item.slot, this.#row(item, clips[item.slot])));
     this.#send.addEventListener("click", (event) => this.submit(event));
     this.element = el(
@@ -85,11 +87,16 @@ export class Ranking {
       el("h2", { id: "rank-title", text: t("rank.title") }),
       el("p", { class: "hint", text: t("rank.hint") }),
       this.#list,
+      el("p", { class: "tap", text: t("rank.tap") }),
       this.#warning,
       this.#say,
       this.#send,
     );
     dragging(this.#list, (from, to) => this.#act(() => this.order.place(from, to)));
+    this.#list.addEventListener("click", (event) => {
+      const row = event.target.closest("li");
+      if (row && !event.target.closest("button")) this.digit(Number(row.dataset.slot));
+    });
     this.#draw();
   }
 
@@ -110,6 +117,7 @@ export class Ranking {
     this.order.selected = at;
     this.#draw();
     this.#rows.get(slot).element.scrollIntoView({ block: "nearest", behavior: calm() ? "auto" : "smooth" });
+    this.#look(slot);
   };
 
   /** Send it; an order that nobody touched needs a second press. */

@@ -10,7 +10,7 @@ const DEFAULTS = {
   speed: 1,
   stacked: false,
   linked: true,
-  markdown: false,
+  written: false,
   diff: false,
   invisible: false,
   length: false,

@@ -5,20 +5,31 @@ import { el, isolate, put, toggle } from "./dom.js";
 import { cut, FIRST, LongText } from "./longtext.js";
 import { settings } from "./settings.js";
 import { t } from "./strings.js";
+import { CUE, turns } from "./turns.js";
+
+/** Whether Markdown and turns are drawn: where the project has it, and the person did not ask for what was written. */
+function drawn(page) {
+  return page.markdown && !settings.get("written");
+}
 
 /** The prompt's panel, or nothing. */
-export function promptView(prompt) {
+export function promptView(prompt, page) {
   if (prompt === null || prompt === undefined) return null;
   const text = new LongText(prompt, { class: "long-text prompt-text" });
-  text.show({ invisible: settings.get("invisible") });
-  const stop = settings.watch((name) => name === "invisible" && text.show({ invisible: settings.get("invisible") }));
+  const show = () => text.show({ drawn: drawn(page), invisible: settings.get("invisible") });
+  show();
+  const stop = settings.watch((name) => ["invisible", "written", ""].includes(name) && show());
   const element = el(
     "section",
     { class: "prompt", testid: "prompt", "aria-label": t("text.prompt"), tabindex: "0" },
     el("h2", { class: "overline", text: t("text.prompt") }),
     text.element,
   );
-  return { element, close: stop };
+  /** Of a conversation the last turn is what was answered. */
+  const begin = () => {
+    if (page.markdown && turns(prompt)) element.scrollTop = element.scrollHeight;
+  };
+  return { element, begin, close: stop };
 }
 
 /** The responses of an assignment, each to be put into a slot: {elements, toolbar, close}. */
@@ -28,10 +39,13 @@ export class Responses {
   #note = el("span", { class: "diff-note", role: "status" });
   #stop;
   #compared = null;
+  #shown = [];
 
-  constructor(items, page) {
+  /** `prompt` is what they answer. */
+  constructor(items, page, prompt) {
     this.#raw = items.map((item) => item.text ?? "");
-    this.#texts = this.#raw.map((text) => new LongText(text));
+    const cue = prompt && turns(prompt) ? CUE : "";
+    this.#texts = this.#raw.map((text) => new LongText(text, {}, cue));
     this.elements = this.#texts.map((text, at) => this.#panel(text, at));
     this.toolbar = this.#tools(page, items.length);
     this.#stop = settings.watch(() => this.#show(page));
@@ -40,6 +54,11 @@ export class Responses {
 
   close() {
     this.#stop();
+  }
+
+  /** What keys do here. */
+  get actions() {
+    return { written: () => settings.set("written", !settings.get("written")) };
   }
 
   #panel(text, at) {
@@ -62,12 +81,13 @@ export class Responses {
     const diff = settings.get("diff") && this.#raw.length === 2 ? this.#difference() : null;
     this.#texts.forEach((text, at) =>
       text.show({
-        markdown: page.markdown && settings.get("markdown"),
+        drawn: drawn(page),
         invisible: settings.get("invisible"),
         length: settings.get("length"),
         runs: diff && [diff.first, diff.second][at],
       }),
     );
+    this.#shown.forEach((show) => show());
     put(this.#note, diff && !diff.whole ? t("text.diff.part") : "");
   }
 
@@ -98,14 +118,19 @@ export class Responses {
   }
 
   #tools(page, count) {
-    const item = (name, key, testid) =>
-      toggle(t(key), settings.get(name), (on) => settings.set(name, on), { "data-testid": testid });
+    const item = (name, key, testid, action) => {
+      const label = action ? [t(key), el("kbd")] : t(key);
+      const props = { testid, class: `toggle ${name}`, data: action ? { action } : {} };
+      const node = toggle(label, settings.get(name), (on) => settings.set(name, on), props);
+      this.#shown.push(() => node.setAttribute("aria-pressed", String(settings.get(name))));
+      return node;
+    };
     return el(
       "div",
       { class: "text-tools", role: "toolbar", "aria-label": t("text.tools") },
       item("stacked", "text.stacked", "toggle-stacked"),
       item("linked", "text.linked", "toggle-linked"),
-      page.markdown ? item("markdown", "text.markdown", "toggle-markdown") : null,
+      page.markdown ? item("written", "text.written", "toggle-written", "written") : null,
       count === 2 ? item("diff", "text.diff", "toggle-diff") : null,
       item("invisible", "text.invisible", "toggle-invisible"),
       item("length", "text.lengths", "toggle-length"),

@@ -10,13 +10,14 @@ const ACTIONS = {
 };
 
 /** A button with its key cap. */
-function choice({ action, testid, label, spoken, kind, slot, sign, run }) {
+function choice({ action, testid, label, short, spoken, kind, slot, sign, run }) {
   const node = el(
     "button",
     { type: "button", class: `choice ${kind}`, testid, "aria-label": spoken, data: { action } },
     slot === undefined ? null : el("span", { class: "badge", data: { slot: String(slot) }, text: String(slot + 1) }),
     sign ? icon(sign) : null,
     el("span", { class: "choice-label", text: label }),
+    short ? el("span", { class: "choice-short", text: short }) : null,
     el("kbd"),
   );
   node.addEventListener("click", (event) => event.detail < 2 && run(event));
@@ -106,6 +107,7 @@ function side(add, outcome, slot) {
 }
 
 const LABELS = () => ({ slight: t("answer.slight"), clear: t("answer.clear"), much: t("answer.much") });
+const SHORT = () => ({ slight: t("answer.slight.short"), clear: t("answer.clear.short"), much: t("answer.much") });
 const SPOKEN = (slot) => ({
   slight: t("answer.slight.spoken", { slot }),
   clear: t("answer.clear.spoken", { slot }),
@@ -118,6 +120,7 @@ function graded(add, outcome, slot, step) {
     action: ACTIONS[outcome][step],
     testid,
     label: LABELS()[step],
+    short: SHORT()[step],
     spoken: SPOKEN(slot + 1)[step],
     kind: `${outcome} ${step}`,
   });
