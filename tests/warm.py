@@ -1,7 +1,8 @@
 """The command `prefrl` without the seconds that its imports take: forked from a process that has imported them.
 
 In the place of the installed command stands a client, which hands its arguments, folder, environment and open files
-over, passes Ctrl-C on, and ends with the status of the command.
+over, passes Ctrl-C on, and ends with the status of the command. Those that a command starts itself by
+`sys.executable -m prefrl` are forked as well.
 """
 
 from __future__ import annotations
@@ -32,25 +33,33 @@ CLIENT = """\
 #!{python} -IS
 import json, os, signal, socket, sys
 
+asked = sys.argv[1:]
+if sys.argv[0].endswith("python"):
+    if asked[:2] != ["-m", "prefrl"]:
+        os.execv({python!r}, [{python!r}, *asked])
+    asked = asked[2:]
 place = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
 place.connect({address!r})
-told = json.dumps([sys.argv[1:], os.getcwd(), dict(os.environ)]).encode()
+told = json.dumps([asked, os.getcwd(), dict(os.environ)]).encode()
 socket.send_fds(place, [len(told).to_bytes(8, "big")], [0, 1, 2])
 place.sendall(told)
 answers = place.makefile()
 pid = int(answers.readline())
-signal.signal(signal.SIGINT, lambda *_: os.kill(pid, signal.SIGINT))
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: os.kill(pid, number))
 sys.exit(int(answers.readline()))
 """
 
 
 @contextmanager
 def commands(folder: Path) -> Iterator[Path]:
-    """A folder for PATH with such a command in it."""
+    """A folder for PATH with such a command in it, and with the `python` that it starts others by."""
     folder.mkdir()
-    client, address = folder / "prefrl", str(folder / "place")
-    client.write_text(CLIENT.format(python=sys.executable, address=address))
-    client.chmod(0o755)
+    address = str(folder / "place")
+    for name in ("prefrl", "python"):
+        client = folder / name
+        client.write_text(CLIENT.format(python=sys.executable, address=address))
+        client.chmod(0o755)
     with subprocess.Popen([sys.executable, __file__, address], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as server:
         assert server.stdin is not None
         assert server.stdout is not None
@@ -99,6 +108,7 @@ def _watch(asked: socket.socket, child: int) -> None:
 
 def _become(asked: socket.socket) -> None:
     size, files, _, _ = socket.recv_fds(asked, 8, 3)
+    sys.executable = str(Path(asked.getsockname()).with_name("python"))
     with asked, asked.makefile("rb") as reader:
         arguments, folder, environment = json.loads(reader.read(int.from_bytes(size, "big")))
     for number, file in enumerate(files):
