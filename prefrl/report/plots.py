@@ -317,7 +317,8 @@ def _svg(name: str, draw: Callable[[Figure], None]) -> Markup:
         for axes in figure.axes:
             axes.set_facecolor("none")
         # Not `savefig`, which lays out and draws everything twice.
-        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)

@@ -7,6 +7,8 @@ median distance as its scale. Left out: boundary medoids and successive eliminat
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from prefrl.types import Floats, Integers
@@ -75,7 +77,7 @@ def _similarity(points: Floats) -> Floats:
     return similar
 
 
-def _distances(points: Floats, metric: str) -> Floats:
+def _distances(points: Floats, metric: Literal["euclidean", "sqeuclidean"]) -> Floats:
     """(N, N) between all points (N, D)."""
     from scipy.spatial.distance import cdist  # a quarter of a second, which few runs need
 
