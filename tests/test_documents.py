@@ -52,9 +52,9 @@ def workshop(demo: Path, tmp_path: Path) -> Path:
 
 
 def sped(line: str) -> str:
-    """A command that runs a toy preset, with what it leaves open set as low as it can be."""
+    """A command that runs a toy preset on its own task, with what it leaves open set as low as it can be."""
     found = re.search(r"prefrl .*?\b(run|label|improve) (control/toy|text/toy)\b", line)
-    if found is None:
+    if found is None or "task." in line:
         return line
     taken = ("learner." if "learner.kind" in line else "", *re.findall(r"[\w.]+(?==)", line))
     low = [one for one in TINY[found[2]] if not one.startswith(tuple(filter(None, taken)))]
