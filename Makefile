@@ -5,6 +5,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PYTEST = .ci/in_memory $(BIN)/python -m pytest -n auto --dist worksteal --hypothesis-seed=$(SEED)
+# Reading all tests to leave most of them out takes as long as a tenth of them.
+HOLDING = $(shell grep -rl --include='test_*.py' 'mark\.$(1)' tests)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # What hypothesis makes up depends on this alone: `make unit SEED=...` makes the same again.
@@ -58,13 +60,13 @@ unit: .venv/dev
 	$(PYTEST)
 
 slow: .venv/dev
-	$(PYTEST) -m slow
+	$(PYTEST) -m slow $(call HOLDING,slow)
 
 browser: .venv/dev
-	$(PYTEST) -m browser
+	$(PYTEST) -m browser $(call HOLDING,browser)
 
 nightly: .venv/dev mutants
-	$(PYTEST) -m nightly
+	$(PYTEST) -m nightly $(call HOLDING,nightly)
 
 # Breaks the product in one place at a time: do the tests notice?
 mutants: .venv/dev

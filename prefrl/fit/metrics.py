@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import log_expit, logsumexp
 
 from prefrl.fit.settings import Ties
@@ -105,6 +104,8 @@ def temperature(
 
     if not len(preference):
         return 1.0
+    from scipy.optimize import minimize_scalar  # half a second, which many commands do without
+
     bound = math.log(HOTTEST)
     return math.exp(float(minimize_scalar(loss, bounds=(-bound, bound), method="bounded").x))
 

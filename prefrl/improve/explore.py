@@ -12,7 +12,6 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from prefrl.improve.vec_env import LearnedReward
 from prefrl.types import Floats
@@ -26,6 +25,8 @@ PARTS = 10
 def state_entropy(points: Floats, among: Floats, neighbours: int) -> Floats:
     """(N,) log(1 + distance) of points (N, O) to the so-many-th nearest of others (M, O); of the farthest where M is
     smaller."""
+    from scipy.spatial import KDTree  # a quarter of a second, which few runs need
+
     # k as a list: that neighbour alone, (N, 1).
     distances = np.asarray(KDTree(among).query(points, k=[min(neighbours, len(among))])[0])
     found: Floats = np.log1p(distances[:, 0])

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import expit
 
 from prefrl.kinds import kind_of
@@ -155,6 +154,8 @@ def rationality_for(seen: Sequence[Floats], tie_within: float, rate: float) -> f
     decided = np.log(pairs[pairs > 0])
     if not len(decided):
         return None
+
+    from scipy.optimize import brentq  # half a second, which few commands need
 
     def excess(log_beta: float) -> float:
         return float(expit(-np.exp(np.minimum(log_beta + decided, np.log(LARGEST)))).mean()) - rate

@@ -7,8 +7,9 @@ median distance as its scale. Left out: boundary medoids and successive eliminat
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from prefrl.types import Floats, Integers
 
@@ -36,7 +37,7 @@ def k_medoids(points: Floats, count: int) -> Integers:
     Starts from `k_center`; then points join their nearest medoid and each cluster takes the point with the smallest
     sum of distances, until nothing changes (Park and Jun 2009).
     """
-    distances = cdist(points, points)
+    distances = _distances(points, "euclidean")
     medoids = k_center(points, count)
     for _ in range(PASSES):
         cluster = distances[:, medoids].argmin(1)
@@ -70,7 +71,14 @@ def dpp(points: Floats, quality: Floats, count: int) -> Integers:
 
 
 def _similarity(points: Floats) -> Floats:
-    squared = cdist(points, points, "sqeuclidean")
+    squared = _distances(points, "sqeuclidean")
     scale = float(np.median(squared[squared > 0])) if (squared > 0).any() else 1.0
     similar: Floats = np.exp(-squared / (2 * scale))
     return similar
+
+
+def _distances(points: Floats, metric: Literal["euclidean", "sqeuclidean"]) -> Floats:
+    """(N, N) between all points (N, D)."""
+    from scipy.spatial.distance import cdist  # a quarter of a second, which few runs need
+
+    return np.asarray(cdist(points, points, metric))

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from scipy import stats
 
 from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Floats
@@ -24,6 +23,8 @@ FEW = 3
 
 def interquartile_mean(scores: Floats, axis: int | None = None) -> Floats:
     """The mean of the middle half: as robust to outliers as a median, and steadier."""
+    from scipy import stats  # a second, which few commands need
+
     return np.asarray(stats.trim_mean(scores, 0.25, axis=axis))
 
 

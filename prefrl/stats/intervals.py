@@ -2,6 +2,8 @@
 
 Intervals are 95 % percentiles of a bootstrap over units: what hangs together is resampled together. Resampling units
 that are alike is drawing how often each pattern comes up: that keeps large tables fast, and changes nothing.
+
+`scipy.stats` takes a second to import, so that only what few commands need is taken from there.
 """
 
 from __future__ import annotations
@@ -11,9 +13,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import stdtrit
 
 from prefrl.stats.estimates import Estimate, undefined, wilson
 from prefrl.types import Floats, Integers
@@ -37,7 +39,11 @@ def share(hits: int, count: int, nothing: str = "nothing to count") -> Estimate:
 
 def position_test(first: int, decided: int) -> float | None:
     """Exact two-sided p-value of `first` preferences for one of two places, of `decided`; None where that is 0."""
-    return float(stats.binomtest(int(first), int(decided), 0.5).pvalue) if decided else None
+    if not decided:
+        return None
+    from scipy import stats
+
+    return float(stats.binomtest(int(first), int(decided), 0.5).pvalue)
 
 
 def mean(
@@ -67,10 +73,10 @@ def average(values: Floats, what: str = "candidates") -> Estimate:
         return undefined("nothing was scored")
     centre = float(values.mean())
     found = Estimate(value=centre, count=len(values))
-    error = float(stats.sem(values)) if len(values) > 1 else 0.0
+    error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
     if not error:
         return found.model_copy(update={"how": "no interval: there is no spread"})
-    low, high = stats.t.interval(0.95, len(values) - 1, centre, error)
+    low, high = (centre + error * stdtrit(len(values) - 1, (1 + side * 0.95) / 2) for side in (-1, 1))
     return found.model_copy(
         update={"low": float(low), "high": float(high), "how": f"Student over {len(values)} {what}"}
     )
@@ -182,8 +188,20 @@ def correlation(
 
 def correlate(kind: Literal["spearman", "pearson", "kendall"], x: Floats, y: Floats) -> float | None:
     """The correlation alone; None where it is not defined."""
-    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0 or np.isnan([x, y]).any():
         return None
-    measure: Any = {"spearman": stats.spearmanr, "pearson": stats.pearsonr, "kendall": stats.kendalltau}[kind]
-    value = float(measure(x, y).statistic)
+    if kind == "spearman":  # every run asks for it, in each round
+        value = float(np.corrcoef(_ranks(x), _ranks(y))[1, 0])
+    else:
+        from scipy import stats
+
+        measure: Any = {"pearson": stats.pearsonr, "kendall": stats.kendalltau}[kind]
+        value = float(measure(x, y).statistic)
     return value if np.isfinite(value) else None
+
+
+def _ranks(values: Floats) -> Floats:
+    """(N,) places in ascending order, from 1; equal values share the mean of theirs."""
+    _, at, counts = np.unique(values, return_inverse=True, return_counts=True)
+    places: Floats = (np.cumsum(counts) - (counts - 1) / 2)[at]
+    return places

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy import stats
 from scipy.sparse import coo_array, csr_array
 
 from prefrl.stats.estimates import Estimate
@@ -99,6 +98,8 @@ def entropies(ratings: Ratings) -> Floats:
     """(Q,) bits of each item's shares of answers, in the order of `item`: 0 where all say the same."""
     if not len(ratings.item):
         return np.zeros(0)
+    from scipy import stats  # a second, which few commands need
+
     return np.asarray(stats.entropy(ratings.counts, base=2, axis=1), np.float64)
 
 

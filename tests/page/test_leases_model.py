@@ -393,7 +393,7 @@ def test_promises_hold_whatever_happens() -> None:
 
 @pytest.mark.slow
 def test_promises_hold_whatever_happens_for_long() -> None:
-    run(40, 80)
+    run(16, 80)
 
 
 @pytest.mark.nightly
