@@ -13,6 +13,7 @@ from sphinx.util.inspect import TypeAliasForwardRef
 from prefrl.cli.describe import ALWAYS, setting_rows
 from prefrl.cli.schema import described, schema_of
 from prefrl.components import TABLE
+from prefrl.config import Config
 from prefrl.types import Json
 
 CODE = re.compile(r"`([^`]+)`")
@@ -41,7 +42,7 @@ def call(_app: Sphinx, what: str, _name: str, obj: Any, _options: object, given:
 
 
 class SettingsList(SphinxDirective):
-    """`{settings} learners`: a section for each kind of a role, or the settings of `loop` or `fitting` alone."""
+    """`{settings} learners`: a section for each kind of a role; or what `config`, `loop` or `fitting` consist of."""
 
     required_arguments = 1
 
@@ -53,6 +54,10 @@ class SettingsList(SphinxDirective):
 
 
 def _listed(name: Any) -> Iterator[nodes.Node]:
+    if name == "config":
+        fields = Config.model_fields.items()
+        yield nodes.definition_list("", *(_item(name, "", "", field.description or "") for name, field in fields))
+        return
     if name in ALWAYS:
         yield from _settings(schema_of(ALWAYS[name]))
         return
