@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.inspect import TypeAliasForwardRef
+from typing_extensions import is_protocol
 
 from prefrl.cli.describe import ALWAYS, setting_rows
 from prefrl.cli.schema import described, schema_of
@@ -37,7 +38,7 @@ def read(_app: Sphinx, _what: str, _name: str, _obj: object, _options: object, l
 
 def call(_app: Sphinx, what: str, _name: str, obj: Any, _options: object, given: str, back: str) -> tuple[str, str]:
     """How something is called: nobody makes a Protocol, and a config comes from `load`."""
-    bare = what == "class" and (issubclass(obj, BaseModel) or getattr(obj, "_is_protocol", False))
+    bare = what == "class" and (issubclass(obj, BaseModel) or is_protocol(obj))
     return ("" if bare else given), back
 
 
