@@ -13,9 +13,6 @@ import pytest
 import warm
 from runs import TINY, copied, made_once
 
-import prefrl
-from prefrl.components import TABLE
-
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 INSTALL = {"pip install 'prefrl[label]'", "pip install '.[all]'", "source .venv/bin/activate"}
@@ -128,11 +125,3 @@ def test_links_between_documents_lead_somewhere() -> None:
     for path in DOCUMENTS:
         for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
             assert (path.parent / target).exists(), f"{path.name} links to {target}"
-
-
-def test_the_reference_has_every_kind_and_every_name_that_is_exported() -> None:
-    reference = "\n".join(path.read_text() for path in (ROOT / "docs/api").glob("*.md"))
-    listed = {tuple(found.split()) for found in re.findall(r"```{settings} (.+)", reference)}
-    assert listed == {("loop",), ("fitting",), *((role, kind) for role in TABLE for kind in TABLE[role])}
-    named = set(re.findall(r"\w+", reference))
-    assert set(prefrl.__all__) <= named

@@ -41,15 +41,16 @@ def explain(name: str | None) -> list[RenderableType]:
 
 def _component(title: str, described: Json) -> list[RenderableType]:
     intro = Text(described.get("description", ""))
-    shown = table(title, ("setting", "type", "default", "meaning"), list(rows(described, described.get("$defs", {}))))
+    rows = list(setting_rows(described, described.get("$defs", {})))
+    shown = table(title, ("setting", "type", "default", "meaning"), rows)
     return [intro, Text(), shown, *_formula(described.get("x-formula", ""))]
 
 
-def rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+def setting_rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
     """A row for each setting; those of a group are told one by one, as `group.name`."""
     for name, setting in described["properties"].items():
         if "$ref" in setting:
-            yield from rows(groups[_name(setting)], groups, f"{prefix}{name}.")
+            yield from setting_rows(groups[_name(setting)], groups, f"{prefix}{name}.")
         elif "oneOf" in setting:
             of_kinds = {kind: groups[_name({"$ref": at})] for kind, at in setting["discriminator"]["mapping"].items()}
             default = setting["default"]["kind"]
@@ -57,7 +58,7 @@ def rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tuple[str,
             for kind, group in of_kinds.items():
                 own = {**group, "properties": {k: x for k, x in group["properties"].items() if k != "kind"}}
                 yield f"{prefix}{name}.kind={kind}", "", "", group.get("description", "")
-                yield from rows(own, groups, f"  {prefix}{name}.")
+                yield from setting_rows(own, groups, f"  {prefix}{name}.")
         else:
             default = _default(setting, name in described.get("required", []))
             yield prefix + name, _type(setting, ", "), default, setting.get("description", "")

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from prefrl.stats.estimates import Estimate, wilson
-from prefrl.stats.intervals import clusters, correlate, correlation, defined, mean
+from prefrl.stats.intervals import average, clusters, correlate, correlation, defined, mean
 
 
 def test_comparisons_that_share_a_candidate_hang_together() -> None:
@@ -104,3 +104,18 @@ def test_the_interval_of_a_correlation_is_one_of_95_percent() -> None:
         found.append(one.high - one.low)
         expected.append(fisher.high - fisher.low)
     assert np.mean(found) == pytest.approx(np.mean(expected), rel=0.07)
+
+
+@pytest.mark.parametrize("levels", [3, 1000])
+def test_rank_correlation_is_scipys_with_and_without_ties(levels: int) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        x, y = rng.integers(levels, size=(2, 30)).astype(float)
+        assert correlate("spearman", x, y) == pytest.approx(float(stats.spearmanr(x, y).statistic), abs=1e-12)
+
+
+def test_an_average_has_students_interval() -> None:
+    values = np.random.default_rng(0).normal(size=12)
+    low, high = stats.t.interval(0.95, 11, values.mean(), stats.sem(values))
+    found = average(values)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-12)
