@@ -18,11 +18,6 @@ TEXT = {
     "sft": ("SFT",),
 }
 """Figure -> learners of `text_frontier.csv` that it is about; the others are grey."""
-CONTROL = {
-    "ppo_control": ("PPO", "A2C"),
-    "pebble": ("PEBBLE", "PPO"),
-}
-"""Figure -> methods of `control_methods.csv`."""
 TASKS = ("control/hopper", "control/cartpole", "control/pendulum", "text/reviews")
 ASKED = {"information+k_medoids": "by disagreement", "uniform": "uniform"}
 STYLES = ("-", "--")
@@ -32,8 +27,6 @@ def main() -> None:
     matplotlib.rcParams |= {"svg.hashsalt": "prefrl", "svg.fonttype": "none", "font.size": 9}
     for name, ours in TEXT.items():
         save(of_text(read("text_frontier"), ours), name)
-    for name, ours in CONTROL.items():
-        save(of_control(read("control_methods"), ours), name)
     save(of_questions(read("reward_selection")), "selection")
 
 
@@ -71,22 +64,6 @@ def of_text(rows: list[dict[str, str]], ours: tuple[str, ...]) -> Figure:
             else:
                 ax.plot(*at, color=GREY, linewidth=1)
     axes[1].legend(frameon=False, loc="lower left")
-    return figure
-
-
-def of_control(rows: list[dict[str, str]], ours: tuple[str, ...]) -> Figure:
-    """Gold over steps and over labels, a line for each seed."""
-    measures = {"steps": "environment steps", "labels": "labels"}
-    figure, axes = panels(("gold", "gold"), "")
-    for ax, (measure, label) in zip(axes, measures.items(), strict=True):
-        ax.set_xlabel(label)
-        for name in ours:
-            color = INK if name == ours[0] else "0.55"
-            for seed in sorted({row["seed"] for row in rows if row["method"] == name}):
-                own = [row for row in rows if (row["method"], row["seed"]) == (name, seed)]
-                at = [float(row[measure]) for row in own], [float(row["gold"]) for row in own]
-                ax.plot(*at, STYLES[ours.index(name)], color=color, label=f"{name}, seed {seed}")
-    axes[1].legend(frameon=False, loc="lower right", fontsize=7)
     return figure
 
 
