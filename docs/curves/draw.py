@@ -18,6 +18,12 @@ TEXT = {
     "sft": ("SFT",),
 }
 """Figure -> learners of `text_frontier.csv` that it is about; the others are grey."""
+CONTROL = {
+    "ppo_control": ("PPO",),
+    "pebble": ("PEBBLE", "PPO"),
+    "memory": ("GRU without velocities", "PPO"),
+}
+"""Figure -> methods of `control_methods.csv`."""
 TASKS = ("control/hopper", "control/cartpole", "control/pendulum", "text/reviews")
 ASKED = {"information+k_medoids": "by disagreement", "uniform": "uniform"}
 STYLES = ("-", "--")
@@ -27,6 +33,9 @@ def main() -> None:
     matplotlib.rcParams |= {"svg.hashsalt": "prefrl", "svg.fonttype": "none", "font.size": 9}
     for name, ours in TEXT.items():
         save(of_text(read("text_frontier"), ours), name)
+    for name, ours in CONTROL.items():
+        save(of_control(read("control_methods"), ours), name)
+    save(of_shares(read("control_offline")), "offline")
     save(of_questions(read("reward_selection")), "selection")
 
 
@@ -64,6 +73,32 @@ def of_text(rows: list[dict[str, str]], ours: tuple[str, ...]) -> Figure:
             else:
                 ax.plot(*at, color=GREY, linewidth=1)
     axes[1].legend(frameon=False, loc="lower left")
+    return figure
+
+
+def of_control(rows: list[dict[str, str]], ours: tuple[str, ...]) -> Figure:
+    """Gold over steps and over labels, a line for each seed."""
+    measures = {"steps": "environment steps", "labels": "labels"}
+    figure, axes = panels(("gold", "gold"), "")
+    for ax, (measure, label) in zip(axes, measures.items(), strict=True):
+        ax.set_xlabel(label)
+        for name in ours:
+            color = INK if name == ours[0] else "0.55"
+            for seed in sorted({row["seed"] for row in rows if row["method"] == name}):
+                own = [row for row in rows if (row["method"], row["seed"]) == (name, seed)]
+                at = [float(row[measure]) for row in own], [float(row["gold"]) for row in own]
+                ax.plot(*at, STYLES[ours.index(name)], color=color, label=f"{name}, seed {seed}")
+    axes[1].legend(frameon=False, loc="lower right", fontsize=7)
+    return figure
+
+
+def of_shares(rows: list[dict[str, str]]) -> Figure:
+    """How far each method came, a dot for each seed."""
+    figure, (ax,) = panels(("share of the way",), "")
+    figure.set_size_inches(4.5, 2.2)
+    ax.set(xlim=(0, 1), ylabel="", xlabel="from the starting policy (0) to the run's last one (1)")
+    ax.plot([float(row["share"]) for row in rows], [row["method"] for row in rows], "o", color=INK)
+    ax.margins(y=0.3)
     return figure
 
 
