@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,8 +57,8 @@ class Run:
         self.notes: list[str] = []
         """What a person should know about the start: from where it goes on, which checkpoints were damaged."""
         _refuse_strangers(self.folder)
-        self.store: Store = Store(self.folder)
-        try:
+        with ExitStack() as opened:  # whatever fails, Ctrl-C too: a folder must not stay owned by a start that failed
+            self.store: Store = opened.enter_context(Store(self.folder))
             _claim(config, self.folder, self.store)
             self.loop: Loop = shared(config.build(self.store))
             if isinstance(self.loop.task, Noted):
@@ -66,12 +67,13 @@ class Run:
             self._rows = self._restore()
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
             self._trackers = Trackers(self.folder, config.model_dump(mode="json"), config.track, self.loop.round)
+            opened.callback(self._trackers.close)
             if isinstance(self.loop.labeler, Attended):
+                # The page is closed before the store: its last answers are still to be written.
+                opened.callback(self.loop.labeler.close)
                 self.notes += self.loop.labeler.open(self.store)
             lead(config.model_dump(mode="json"), self.loop)
-        except BaseException:  # Ctrl-C too: a folder must not stay owned by a start that failed
-            self.store.close()
-            raise
+            self._opened = opened.pop_all()
 
     @classmethod
     def resume(cls, folder: str | Path) -> Run:
@@ -86,11 +88,7 @@ class Run:
 
     def close(self) -> None:
         """Let go of the folder; people can answer until then."""
-        # The page before the store: its last answers are still to be written.
-        if isinstance(self.loop.labeler, Attended):
-            self.loop.labeler.close()
-        self._trackers.close()
-        self.store.close()
+        self._opened.close()
 
     def __iter__(self) -> Iterator[Round]:
         turns = rounds(self.loop)

@@ -171,7 +171,8 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
             )
         reward = config.build_reward(task, rng.build)
         fitted = fit(reward, store, config.fitting, rng.fit)
-        names = (out.resolve().name, source.name)
+        save_reward(out, config, reward, fitted)  # before it is graded: an interruption there loses no fit
+        names = (out.resolve().name, source.resolve().name)
         subject = of_judgements(reward, store, names, config.fitting, [fitted.row()], config.discount, held_out=True)
         card = grade(subject, rng.evaluate) if subject is not None and len(fitted.predicted) else None
     save_reward(out, config, reward, fitted, card)
@@ -427,7 +428,7 @@ def report_card(
             round = json.loads((saved.folder / "loop.json").read_text())["round"]
             subject = of_run(reward, store, model, round, fitting, discount)
         else:
-            names = (model.resolve().name, source.name)
+            names = (model.resolve().name, source.resolve().name)
             subject = of_judgements(reward, store, names, fitting, _fits(model), discount, held_out)
         if subject is None:
             raise RunError(f"{source}: no judgement is held out that the reward model could be graded on")

@@ -18,8 +18,6 @@ SAID = {
     "sb3_on_a_learned_reward": "pendulum.zip: SAC after 600 steps",
 }
 """A script -> the last thing that it says."""
-
-
 NOTEBOOKS = ("control", "text")
 
 
@@ -43,7 +41,7 @@ def test_a_notebook_runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pa
     assert all(output["output_type"] != "error" for cell in code for output in cell["outputs"])
     source = "\n".join("".join(cell["source"]) for cell in code).replace("text/reviews", "text/toy")
     execute(tmp_path, "-c", source)
-    assert (tmp_path / "runs/notebook/report.html").exists()
+    assert (tmp_path / f"runs/{name}-notebook/report.html").exists()
 
 
 def execute(folder: Path, *program: str) -> str:

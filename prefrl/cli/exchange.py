@@ -90,6 +90,10 @@ def export_(
     """Write judgements, a reward model of text or a policy to files, and say what these could not hold."""
     from prefrl.cli.console import say
 
+    if best and form not in (Form.sb3, Form.onnx):
+        raise ValueError(f"--best goes with --form sb3 and --form onnx: {form.value} has no best policy")
+    if form is Form.sb3 and not to.suffix:
+        to = to.with_suffix(".zip")  # as stable-baselines3 does
     if to.is_file() and not force:
         raise ValueError(f"{to} is there already: choose another name, or write over it with --force")
     if form in MODELS:

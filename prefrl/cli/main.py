@@ -147,7 +147,7 @@ def label(
     from prefrl.rundir import open_saved
     from prefrl.storage.log import has_store
 
-    there = serve and has_store(Path(source)) and out in (None, Path(source))
+    there = serve and has_store(Path(source)) and (out is None or out.resolve() == Path(source).resolve())
     _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
     _refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
     own = there and (given is not None or bool(policies))

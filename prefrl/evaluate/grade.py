@@ -152,7 +152,7 @@ def of_judgements(
 ) -> Subject | None:
     """A reward model on judgements from anywhere, `held_out` on those alone that a fit on them leaves out.
 
-    `names`: of the model and of the data. `rows`: what its fits came to. None where there is nothing to grade on.
+    `names`: of the model and of the data. `rows`: the metrics of its fits. None where there is nothing to grade on.
     """
     judged = judgements(store, fitting.held_out if held_out else None)
     if not judged:

@@ -206,7 +206,8 @@ class WebLabeler:
                 site.clips.want(one, soon=True)
             return []
         self._warm = True
-        self._print(f"drawing the first {len(first)} clips, for {limit:g} seconds at most")
+        clips = "the first clip" if len(first) == 1 else f"the first {len(first)} clips"
+        self._print(f"drawing {clips}, for {limit:g} seconds at most")
         trouble = site.clips.draw(first, limit)
         return [f"the first clips are not there yet ({trouble}): the page goes on trying"] if trouble else []
 

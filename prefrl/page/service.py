@@ -23,11 +23,13 @@ from prefrl.page.intake import Intake, Reopened, Taken
 from prefrl.page.questions import Given, Terms, ignored
 from prefrl.page.security import Buckets, Refused
 from prefrl.page.texts import (
+    OFFERED,
     TEXT,
     Consent,
     agreement_event,
     agreements,
     guideline_event,
+    offered_event,
     text_event,
     version_of,
 )
@@ -224,12 +226,13 @@ class Service:
     def _take_up(self, kept: Fields) -> None:
         """The texts and settings that hold: those that were made on the page before those that this was started with.
 
-        What is agreed to can be changed by the settings alone.
+        The guideline that we ship gives way to any other. What is agreed to can be changed by the settings alone.
         """
         terms, text = self.terms, kept.get("guideline", "")
-        if not text and terms.guideline:
+        ours = not text or kept.get(OFFERED) == version_of(text)
+        if ours and text != terms.guideline:
             text = terms.guideline
-            self.append([guideline_event(text, "")])
+            self.append([guideline_event(text, ""), offered_event(version_of(text) if terms.offered else "")])
         self.guideline = api.Guideline(version=version_of(text), text=text)
         if terms.consent != kept.get(TEXT, ""):
             self.append([text_event(terms.consent)])

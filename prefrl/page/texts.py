@@ -13,6 +13,8 @@ from prefrl.storage.log import row
 from prefrl.types import Fields
 
 TEXT = "consent"
+OFFERED = "guideline:offered"
+"""The version of the guideline that we ship, where that is the one that was written down: it gives way to any other."""
 AGREED = "consent:"
 """Before the name of who has agreed, to which version."""
 
@@ -68,6 +70,11 @@ class Consent:
 def agreements(kept: Fields) -> dict[str, str]:
     """Name -> version, of a store's settings."""
     return {key.removeprefix(AGREED): version for key, version in kept.items() if key.startswith(AGREED)}
+
+
+def offered_event(version: str) -> Event:
+    """The guideline of this version is ours; "" where it is not."""
+    return row(f"project:{uuid.uuid4().hex}", "project", body={OFFERED: version})
 
 
 def text_event(text: str) -> Event:

@@ -6,7 +6,9 @@ cards of Hugging Face, with the results as a `model-index`.
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -35,21 +37,21 @@ USES = {
         "transformers",
         "python",
         "from transformers import AutoModelForSequenceClassification\n\n"
-        'model = AutoModelForSequenceClassification.from_pretrained("{to}")  # its logit is the score',
+        "model = AutoModelForSequenceClassification.from_pretrained({to})  # its logit is the score",
     ),
     "policy": (
         "transformers",
         "python",
         "from transformers import AutoModelForCausalLM, AutoTokenizer\n\n"
-        'model = AutoModelForCausalLM.from_pretrained("{to}")\ntokenizer = AutoTokenizer.from_pretrained("{to}")',
+        "model = AutoModelForCausalLM.from_pretrained({to})\ntokenizer = AutoTokenizer.from_pretrained({to})",
     ),
     "adapter": (
         "peft",
         "python",
-        'from peft import AutoPeftModelForCausalLM\n\nmodel = AutoPeftModelForCausalLM.from_pretrained("{to}")',
+        "from peft import AutoPeftModelForCausalLM\n\nmodel = AutoPeftModelForCausalLM.from_pretrained({to})",
     ),
-    "sb3": ("stable-baselines3", "python", 'from prefrl import load_policy\n\npolicy = load_policy("{to}")'),
-    "onnx": ("onnx", "python", 'import onnxruntime\n\nsession = onnxruntime.InferenceSession("{to}")'),
+    "sb3": ("stable-baselines3", "python", "from prefrl import load_policy\n\npolicy = load_policy({to})"),
+    "onnx": ("onnx", "python", "import onnxruntime\n\nsession = onnxruntime.InferenceSession({to})"),
 }
 """What a model was written as -> the library that reads it, and how."""
 JUDGES = ("reward", "classifier")
@@ -123,7 +125,7 @@ class Card:
                 yield {"type": kind, "name": name, "value": round(found.value, 4)}
 
     def _gained(self) -> Iterable[Json]:
-        """What a policy's last evaluation came to."""
+        """The numbers of a policy's last evaluation."""
         if self.best:
             return
         after, spread = self.facts.gold[1], self.facts.gold_spread[1]
@@ -137,21 +139,22 @@ class Card:
             yield {"type": "win_rate", "name": "win rate against the start, by the reward model", "value": won}
 
     def _judge(self) -> Iterable[str]:
-        yield f"# {self.name}: a reward model from preferences"
+        yield f"# {_plain(self.name)}: a reward model from preferences"
         if self.record.card is None:
             yield "No judgement was held out, so it was not graded."
             return
-        yield f"{card_headline(self.record.card)} {card_subject(self.record.card.about)}."
+        yield f"{card_headline(self.record.card)} {_plain(card_subject(self.record.card.about))}."
         rows = [
-            f"| {group}: {_cell(row.name)} | {_cell(row.value) or '–'} | {_cell(row.note)} |"
+            f"| {group}: {_plain(row.name)} | {_plain(row.value) or '–'} | {_plain(row.note)} |"
             for group, found in groups(self.record.card)
+            if group != "Labelers"  # who answered is nobody's business but the project's
             for row in found
         ]
         yield "## Report card\n\n| | | |\n|---|---|---|\n" + "\n".join(rows)
 
     def _policy(self) -> Iterable[str]:
         facts = self.facts
-        yield f"# {self.name}: a policy from preferences"
+        yield f"# {_plain(self.name)}: a policy from preferences"
         if self.best:
             yield "This is the best policy by the newest reward. The numbers below are of the last one."
         yield f"{headline(facts)} {verdict(facts)}".strip()
@@ -169,7 +172,7 @@ class Card:
 
     def _made(self) -> str:
         """The settings, less what concerns who was asked where."""
-        goal = visible(self.settings.get("goal"), 200)
+        goal = _plain(visible(self.settings.get("goal"), 200))
         parts = (
             ("task", "reward", "fitting") if self.form in JUDGES else ("task", "reward", "fitting", "learner", "loop")
         )
@@ -183,9 +186,10 @@ class Card:
 
     def _use(self) -> str:
         _, language, lines = USES[self.form]
-        return f"## Use\n\n```{language}\n{lines.format(to=self.name)}\n```"
+        to = json.dumps(self.name, ensure_ascii=False) if language == "python" else shlex.quote(self.name)
+        return f"## Use\n\n```{language}\n{lines.format(to=to)}\n```"
 
 
-def _cell(text: str) -> str:
-    """What stands in a table as it is, whatever a labeler is called."""
-    return re.sub(r"([|<`*_\[\]\\])", r"\\\1", text)
+def _plain(text: str) -> str:
+    """A text as it stands on one line, whatever is in it."""
+    return re.sub(r"([|<`*_\[\]\\])", r"\\\1", " ".join(text.split()))

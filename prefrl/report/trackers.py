@@ -31,7 +31,20 @@ def _check(place: str) -> str:
 
 Place = Annotated[str, AfterValidator(_check)]
 """A tracker and, after a colon, the project in it (`prefrl` where none is named)."""
-Places = Annotated[tuple[Place, ...], BeforeValidator(lambda given: [given] if isinstance(given, str) else given)]
+
+
+def _once(places: tuple[str, ...]) -> tuple[str, ...]:
+    names = [place.partition(":")[0] for place in places]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"{twice[0]} is named twice: a run is shown once in each tracker")
+    return places
+
+
+Places = Annotated[
+    tuple[Place, ...],
+    BeforeValidator(lambda given: [given] if isinstance(given, str) else given),
+    AfterValidator(_once),
+]
 """Several, or one by its name alone."""
 
 
@@ -116,6 +129,7 @@ class WandB:
             group=run.folder.resolve().parent.name,
             id=self.known,
             resume="allow",
+            reinit="create_new",  # not into a run that a script of the user's has open
             dir=str(run.folder),
             config=run.settings,
             settings=wandb.Settings(silent=True, disable_git=True),
@@ -142,12 +156,22 @@ class MLflow:
             self.known = run.known
             self._client.update_run(run.known, status="RUNNING")
             return
-        found = self._client.get_experiment_by_name(run.project)
-        experiment = found.experiment_id if found else self._client.create_experiment(run.project)
-        self.known = self._client.create_run(experiment, run_name=run.name).info.run_id
+        self.known = self._client.create_run(self._experiment(run.project), run_name=run.name).info.run_id
         params = [Param(key, str(value)[:LONGEST]) for key, value in flat(run.settings)]
         for start in range(0, len(params), AT_ONCE):
             self._client.log_batch(self.known, params=params[start : start + AT_ONCE])
+
+    def _experiment(self, name: str) -> str:
+        from mlflow.exceptions import MlflowException
+
+        if found := self._client.get_experiment_by_name(name):
+            return str(found.experiment_id)
+        try:
+            return str(self._client.create_experiment(name))
+        except MlflowException:  # a run that began at the same moment may have made it
+            if found := self._client.get_experiment_by_name(name):
+                return str(found.experiment_id)
+            raise
 
     def log(self, round: int, metrics: Mapping[str, float]) -> None:
         from mlflow.entities import Metric
@@ -203,5 +227,10 @@ def _begun(place: str, run: Tracked) -> Tracker:
 
 def _known(folder: Path) -> dict[str, str]:
     path = folder / FILE
-    found: dict[str, str] = json.loads(path.read_text()) if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    try:
+        found: dict[str, str] = json.loads(path.read_text())
+    except ValueError as error:
+        raise ConfigError(f"{path} is damaged ({error}): remove it, and trackers begin new runs") from error
     return found

@@ -86,6 +86,22 @@ def test_wide_code_scrolls_in_its_own_block_and_keeps_its_arrows_when_it_was_tab
     ann.saved()
 
 
+HIDING = "```\ncode\n``` hidden\nmore\n```\nafter\n\n1. a\n   - b\n2. c\n9. d"
+RUNS_ON = "I can.\n\nHuman: And you?\n\nHuman:"
+
+
+def test_nothing_hides_behind_a_fence_and_numbers_and_turns_are_those_that_were_written(
+    tmp_path: Path, open_house: Open, visit: Visit
+) -> None:
+    ann = visit(open_house(fill(tmp_path / "odd", [said(CHAT, HIDING, RUNS_ON)])).link("ann"))
+    ann.question()
+    hiding, runs_on = ann.page.locator(panel("hidden")), ann.page.locator(panel("I can."))
+    expect(hiding.locator("pre")).to_have_text("code\n``` hidden\nmore")
+    items = hiding.locator("li").evaluate_all("all => all.map(one => [one.textContent, one.getAttribute('value')])")
+    assert items == [["a", "1"], ["b", None], ["c", "2"], ["d", "9"]]
+    assert runs_on.locator(".turn-speaker").all_text_contents() == ["Assistant", "Human", "Human"]
+
+
 TRANSCRIPTS = (
     CHAT,
     "Human: a",

@@ -46,6 +46,8 @@ def test_a_policy_leaves_with_a_readme(prefrl: Command, tmp_path: Path, monkeypa
     monkeypatch.setattr("prefrl.stages.export_onnx", lambda source, to, best: to.write_bytes(b"a network"))
     assert prefrl("export run --form onnx --to policy.onnx")[0] == 0
     assert "Gold rose from −1,200 to −180" in (tmp_path / "policy.onnx.md").read_text()
+    code, printed = prefrl("export run --form policy --best --to policy")
+    assert (code, "--best goes with --form sb3" in printed) == (2, True)
 
 
 def test_an_export_says_what_it_left_out(prefrl: Command) -> None:

@@ -108,11 +108,23 @@ def test_without_a_guideline_people_read_one_that_says_what_is_asked_and_how_to_
 
 def test_the_guideline_that_we_ship_gives_way_to_the_stores_own(asked: Store[Segment]) -> None:
     for settings, text in (({"guideline": "Look."}, "Look."), ({}, "Look."), ({"guideline": ""}, "Look.")):
-        made = labeler(**settings)
-        assert len(made.open(asked)) == 1, "no setting is said to be ignored"
-        assert made._site is not None
-        assert made._site.service.guideline.text == text
-        made.close()
+        assert opened_guideline(asked, **settings) == text
+
+
+@pytest.mark.parametrize("given", ["Look.", ""])
+def test_a_guideline_of_ones_own_takes_the_place_of_the_shipped_one(asked: Store[Segment], given: str) -> None:
+    for settings, text in (({}, "**Which clip is better?**"), ({"question": "Calmer?"}, "**Calmer?**")):
+        assert opened_guideline(asked, **settings).startswith(text)
+    assert opened_guideline(asked, guideline=given) == given
+
+
+def opened_guideline(store: Store[Segment], **settings: str) -> str:
+    made = labeler(**settings)
+    assert len(made.open(store)) == 1, "no setting is said to be ignored"
+    assert made._site is not None
+    text = made._site.service.guideline.text
+    made.close()
+    return text
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,16 @@ def test_a_policy_carries_its_gold_its_question_and_what_made_it(tmp_path: Path)
     assert "10.0.0.7" not in card.text  # who was asked where is nobody's business
 
 
+def test_names_of_any_kind_break_neither_the_page_nor_the_lines_that_load_it(tmp_path: Path) -> None:
+    run = folder_of_run(tmp_path / "run", [-1200.0, -180.0], SETTINGS | {"goal": "Which?\n# No heading"})
+    (tmp_path / 'my "best" one').mkdir()
+    text = write_readme(run, tmp_path / 'my "best" one', "policy", "text").read_text()
+    assert "\n# No heading" not in text
+    assert r'from_pretrained("my \"best\" one")' in text
+    text = write_readme(run, tmp_path / 'my "best" one', "reward", "control").read_text()
+    assert "--reward 'my \"best\" one' --data" in text
+
+
 def test_the_best_policy_does_not_carry_the_numbers_of_the_last_one(tmp_path: Path) -> None:
     run = folder_of_run(tmp_path / "run", [-1200.0, -180.0], SETTINGS)
     (tmp_path / "out").mkdir()
@@ -67,8 +77,9 @@ def test_a_reward_model_carries_its_report_card_whatever_its_labelers_are_called
     results = {one.metric_type: one.metric_value for one in found.data.eval_results}
     assert results["accuracy"] == round(card.accuracy.value or 0.0, 4)
     assert "log_loss" in results
-    assert r"\<script>alert(1)" in found.text
-    assert all(line.count(" | ") == 2 for line in found.text.splitlines() if line.startswith("| Labelers"))
+    assert r"judgements of \</bdi>" in found.text
+    assert "<script>" not in found.text.replace(r"\<script>", "")
+    assert "ann" not in found.text.split()  # nobody is named who answered
     assert "prefrl improve PRESET --reward reward" in found.text
 
 

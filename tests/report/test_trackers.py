@@ -38,6 +38,11 @@ def test_no_tracker_is_told_unless_it_is_named() -> None:
     assert names(track=["mlflow", "wandb:hoppers"]).track == ("mlflow", "wandb:hoppers")
 
 
+def test_a_tracker_is_named_once() -> None:
+    with pytest.raises(ConfigError, match="wandb is named twice"):
+        names(track=["wandb:a", "wandb:b"])
+
+
 @pytest.mark.parametrize("wrong", ["comet", "wandb:", ":hoppers"])
 def test_a_tracker_that_is_not_there_is_named_with_those_that_are(wrong: str) -> None:
     with pytest.raises(ConfigError, match=r"track.*expected one of wandb, mlflow, trackio.*got") as found:
@@ -78,6 +83,25 @@ def test_a_tracker_that_is_not_installed_is_named_with_its_extra(
     monkeypatch.setitem(sys.modules, "trackio", None)
     with pytest.raises(ConfigError, match=r"track: trackio needs the package 'trackio'; run: pip install 'prefrl\["):
         Trackers(tmp_path, {}, ["trackio"], 0)
+
+
+def test_a_start_that_fails_later_closes_what_had_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = Heard()
+    monkeypatch.setattr("prefrl.report.trackers.TRACKERS", {"wandb": lambda run: begun})
+
+    def fails(*_: object) -> None:
+        raise OSError("a rank is gone")
+
+    monkeypatch.setattr("prefrl.rundir.lead", fails)
+    with pytest.raises(OSError, match="a rank is gone"):
+        Run(tiny("control/toy", "track=wandb"), tmp_path / "run")
+    assert begun.closed == 1
+
+
+def test_a_damaged_memory_of_trackers_is_named(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text("{")
+    with pytest.raises(ConfigError, match=rf"{FILE} is damaged.*remove it"):
+        Trackers(tmp_path, {}, ["wandb"], 0)
 
 
 def told(folder: Path, place: str) -> None:

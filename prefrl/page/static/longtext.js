@@ -8,8 +8,8 @@ import { bubbles, turns } from "./turns.js";
 
 /** Characters shown at first. */
 export const FIRST = 20_000;
-/** Characters that are drawn as Markdown and turns. */
-const DRAWN = 10 * FIRST;
+/** Characters that are drawn as Markdown and turns: hostile ones take a quarter of a second. */
+const DRAWN = 2 * FIRST;
 /** Characters in a block that the browser lays out only when it comes into sight. */
 const BLOCK = 16_000;
 
@@ -45,10 +45,11 @@ export class LongText {
   #drawn(part) {
     const said = turns(this.#cue + part);
     if (!said || (this.#cue && said.length === 1)) return formatted(part);
-    return bubbles(said, (content) => {
+    const draw = (content) => {
       const nodes = formatted(content);
       return el("div", { class: nodes ? "turn-text" : "turn-text written", dir: "auto" }, nodes ?? content);
-    });
+    };
+    return bubbles(said, draw, !this.#cue);
   }
 
   #nodes(part, { invisible, runs }) {

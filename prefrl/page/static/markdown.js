@@ -67,11 +67,13 @@ function block(lines, at, depth) {
   return paragraph(lines, at);
 }
 
-/** What stands behind the opening fence, a language mostly, is shown: text could hide there. */
+/** What stands behind the opening fence, a language mostly, is shown, and a closing one has nothing behind it: text could
+ * hide there. */
 function fence(lines, at) {
   const [, indent, mark, info] = FENCE.exec(lines[at]);
   let end = at + 1;
-  while (end < lines.length && !lines[end].trim().startsWith(mark)) end += 1;
+  const close = new RegExp(`^\\s{0,8}${mark[0]}{${mark.length},}\\s*$`);
+  while (end < lines.length && !close.test(lines[end])) end += 1;
   const code = lines.slice(at + 1, end).map((line) => (line.startsWith(indent) ? line.slice(indent.length) : line));
   return [
     el(
@@ -129,16 +131,23 @@ function quote(lines, at, depth) {
   return [el("blockquote", { dir: "auto" }, markdown(inner, depth + 1)), end];
 }
 
-/** Deeper items are indented, not nested: a judge needs the look, not the tree. */
+/** Deeper items are indented, not nested: a judge needs the look, not the tree. Numbers are those that were written. */
 function list(lines, at) {
-  const ordered = BULLET.exec(lines[at])[2] !== undefined;
-  const node = ordered ? el("ol", { start: BULLET.exec(lines[at])[2] }) : el("ul");
+  const node = el(BULLET.exec(lines[at])[2] === undefined ? "ul" : "ol");
   let end = at;
   for (; end < lines.length; end++) {
     const item = BULLET.exec(lines[end]);
     if (item)
       node.append(
-        el("li", { dir: "auto", class: `depth-${Math.min(3, Math.floor(item[1].length / 2))}` }, inline(item[3])),
+        el(
+          "li",
+          {
+            dir: "auto",
+            class: `depth-${Math.min(3, Math.floor(item[1].length / 2))} ${item[2] ? "numbered" : "bulleted"}`,
+            ...(item[2] ? { value: item[2] } : {}),
+          },
+          inline(item[3]),
+        ),
       );
     else if (/^\s{2,}\S/.test(lines[end])) node.lastChild.append(" ", ...inline(lines[end].trim()));
     else break;

@@ -19,10 +19,10 @@ export function turns(text) {
   }));
 }
 
-/** Turns as nodes; `draw(content)` gives what one holds. The cue at the end of a prompt is no turn. */
-export function bubbles(said, draw) {
+/** Turns as nodes; `draw(content)` gives what one holds. The cue at the end of a prompt (`cued`) is no turn. */
+export function bubbles(said, draw, cued) {
   return said
-    .filter(({ content }, at) => content || at < said.length - 1)
+    .filter(({ speaker, content }, at) => content || !cued || speaker !== "Assistant" || at < said.length - 1)
     .map(({ speaker, content }) =>
       el(
         "div",
