@@ -1,4 +1,4 @@
-"""Our own policy gradients for on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
+"""Our own policy gradients on the learned reward: PPO, A2C, REINFORCE with a learned baseline.
 
 Variant: PPO's clip with GAE (Schulman et al. 2016, 2017), advantages whitened over the rollout, a learning rate steered
 by the KL in place of early stopping, and extra epochs for the critic after each fit of the reward. Values are not
