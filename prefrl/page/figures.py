@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 import numpy as np
+import scipy.stats  # noqa: F401  # agreement needs it: it is loaded with the dashboard, and not amid a later request
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
