@@ -50,4 +50,5 @@ class Child:
 
 
 def serve_command(folder: Path, port: int, overrides: Sequence[str] = ()) -> list[str]:
-    return ["label", str(folder), "--serve", "--port", str(port), *overrides]
+    """On a page without a guideline, which would stand before the first question."""
+    return ["label", str(folder), "--serve", "--port", str(port), 'labeler.guideline=""', *overrides]
