@@ -67,8 +67,10 @@ function block(lines, at, depth) {
   return paragraph(lines, at);
 }
 
-/** What stands behind the opening fence, a language mostly, is shown, and a closing one has nothing behind it: text could
- * hide there. */
+/**
+ * What stands behind the opening fence, a language mostly, is shown, and a closing one has nothing behind it: text
+ * could hide there.
+ */
 function fence(lines, at) {
   const [, indent, mark, info] = FENCE.exec(lines[at]);
   let end = at + 1;
