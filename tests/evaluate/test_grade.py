@@ -177,7 +177,7 @@ def test_the_cards_of_a_run_discount_as_its_learner_does(tmp_path: Path, monkeyp
         return grade(subject, rng)
 
     monkeypatch.setattr("prefrl.rundir.grade", graded)
-    monkeypatch.setattr("prefrl.stages.grade", graded)
+    monkeypatch.setattr("prefrl.stages.rewards.grade", graded)
     small = ["loop.rounds=1", "loop.labels=24", "fitting.epochs=1", "fitting.held_out=0.5", "learner.kind=sb3"]
     config = Config.load("control/toy", [*small, "learner.steps_per_round=320", "learner.options={gamma: 0.9}"])
     with Run(config, tmp_path / "run") as run:

@@ -1,0 +1,38 @@
+"""A run tried at a small size: how long will the whole take?"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from prefrl.components import Settings
+from prefrl.config import Config
+from prefrl.store import Store
+
+
+def shrink(config: Config) -> Config:
+    """The same components with as little work as possible: one round, a handful of labels."""
+    parts = {name: value.shrunk() for name, value in config if isinstance(value, Settings)}
+    return config.model_copy(update=parts)
+
+
+def estimate(config: Config) -> float:
+    """Seconds that a run would take, about, from one small round of the true task in a temporary folder.
+
+    Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
+    """
+    small = shrink(config)
+    learner = small.learner.with_evaluation_of(config.learner)
+    small = small.model_copy(update={"task": config.task, "learner": learner})
+    with tempfile.TemporaryDirectory() as scratch, Store(Path(scratch)) as store:
+        loop = small.build(store)
+        start, one = (round.metrics for round in loop.run())
+    growth = {
+        "sample": config.loop.labels / small.loop.labels if small.loop.labels else 0.0,
+        "label": config.loop.labels / small.loop.labels if small.loop.labels else 0.0,
+        # a fit sees all labels so far: half of them, on the average round
+        "fit": config.loop.rounds * config.loop.labels / 2 / max(small.loop.labels, 1),
+        "improve": config.loop.rounds * config.learner.work() / small.learner.work(),
+    }
+    evaluation = start["seconds/evaluate"] * (config.loop.rounds + 1)
+    return evaluation + sum(one.get(f"seconds/{stage}", 0.0) * factor for stage, factor in growth.items())
