@@ -79,7 +79,8 @@ def test_a_reward_model_carries_its_report_card_whatever_its_labelers_are_called
     assert "log_loss" in results
     assert r"judgements of \</bdi>" in found.text
     assert "<script>" not in found.text.replace(r"\<script>", "")
-    assert "ann" not in found.text.split()  # nobody is named who answered
+    assert "Labelers" not in found.text  # nobody is named who answered
+    assert "ann:" not in found.text
     assert "prefrl improve PRESET --reward reward" in found.text
 
 
