@@ -78,6 +78,10 @@ def test_the_words_of_the_goal_are_a_setting_only_where_a_model_reads_them(label
     assert (_lasting(old) != _lasting(new)) is matters
 
 
+def test_a_run_may_be_shown_elsewhere_from_one_start_to_the_next() -> None:
+    assert _lasting(tiny("control/toy")) == _lasting(tiny("control/toy", "track=wandb"))
+
+
 DYING = """
 import itertools, os, signal, sys, torch
 from prefrl import Config, Run

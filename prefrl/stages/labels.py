@@ -79,6 +79,8 @@ def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: No
     saved_config(folder)  # says what is missing, if it is
     config = Config.reopen(folder / "config.yaml", ["labeler.kind=web", *overrides])
     with Store(folder) as store:
+        if not store.open_queries():
+            tell(f"everything is answered in {folder}; new questions: prefrl label {folder} --serve --out ANOTHER")
         labeler = config.build_labeler(config.build_task())
         with attended(labeler, store, tell):
             labeler.answer(store, streams(config.seed, 1).label)

@@ -87,19 +87,23 @@ def test_wide_code_scrolls_in_its_own_block_and_keeps_its_arrows_when_it_was_tab
 
 
 HIDING = "```\ncode\n``` hidden\nmore\n```\nafter\n\n1. a\n   - b\n2. c\n9. d"
-RUNS_ON = "I can.\n\nHuman: And you?\n\nHuman:"
+RUNS_ON = "I can.\n\nHuman: And you?\n\nAssistant:"
+CUT = "Human: Can you read?\n\nAssistant: Yes.\n\nHuman:"
 
 
 def test_nothing_hides_behind_a_fence_and_numbers_and_turns_are_those_that_were_written(
     tmp_path: Path, open_house: Open, visit: Visit
 ) -> None:
-    ann = visit(open_house(fill(tmp_path / "odd", [said(CHAT, HIDING, RUNS_ON)])).link("ann"))
+    ann = visit(open_house(fill(tmp_path / "odd", [said(CHAT, HIDING, RUNS_ON), said(CUT, "a", "b")])).link("ann"))
     ann.question()
     hiding, runs_on = ann.page.locator(panel("hidden")), ann.page.locator(panel("I can."))
     expect(hiding.locator("pre")).to_have_text("code\n``` hidden\nmore")
     items = hiding.locator("li").evaluate_all("all => all.map(one => [one.textContent, one.getAttribute('value')])")
     assert items == [["a", "1"], ["b", None], ["c", "2"], ["d", "9"]]
-    assert runs_on.locator(".turn-speaker").all_text_contents() == ["Assistant", "Human", "Human"]
+    assert runs_on.locator(".turn-speaker").all_text_contents() == ["Assistant", "Human", "Assistant"]
+    ann.press("1")
+    expect(ann.page.locator(".prompt .turn-text").first).to_have_text("Can you read?")
+    assert ann.page.locator(".prompt .turn-speaker").all_text_contents() == ["Human", "Assistant", "Human"]
 
 
 TRANSCRIPTS = (

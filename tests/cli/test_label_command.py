@@ -40,6 +40,7 @@ def test_a_store_in_another_database_is_served_and_its_queries_counted_once(pref
         query = store.judged()[0].query
         store.answer([Comparison(query.id, 1.0, "somebody else")])
     assert prefrl("label pool --serve --port 0") == 0  # all is answered: it ends at once
+    assert "everything is answered in pool; new questions: prefrl label pool --serve --out" in prefrl.out
     assert "3 of 3 queries answered, 0 skipped, in pool" in prefrl.out
 
 

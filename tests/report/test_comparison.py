@@ -13,7 +13,8 @@ Folder = Path
 
 
 def settings(seed: int, rate: float = 0.1, **learner: Any) -> dict[str, Any]:
-    return {"seed": seed, "learner": {"kind": "control", "learning_rate": rate, **learner}, "labeler": {"port": seed}}
+    free = {"labeler": {"port": seed}, "track": ["wandb"][:seed]}  # neither makes another group
+    return {"seed": seed, "learner": {"kind": "control", "learning_rate": rate, **learner}} | free
 
 
 @pytest.fixture
