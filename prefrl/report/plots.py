@@ -289,6 +289,7 @@ def _values_axis(axes: Axes, values: list[float], percent: bool, zero: bool) -> 
     """Shares that are none, and counts below 0, are drawn as they are: a wrong number must be seen."""
     if percent and min(values) >= 0 and max(values) <= 1:
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))  # 97.5 would be called 98
         axes.set_ylim(top=1.0)
     elif max(map(abs, values)) >= 10_000:
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))
@@ -304,7 +305,7 @@ def _rounds_axis(axes: Axes) -> None:
 def _legend(axes: Axes, entries: int) -> None:
     """Above the axes, where it hides nothing."""
     if entries:
-        axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.98), ncols=entries, handlelength=1.4, borderaxespad=0)
+        axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.03), ncols=entries, handlelength=1.4, borderaxespad=0)
 
 
 def _svg(name: str, draw: Callable[[Figure], None]) -> Markup:
