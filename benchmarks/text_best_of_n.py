@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from prefrl.evaluate.best_of_n import expected, kl_bound
-from prefrl.protocols import RewardModel, TextTask
+from prefrl.protocols import TextTask
 from prefrl.rundir import open_saved
 from prefrl.stages import reward_of
 from prefrl.storage.checkpoints import load_state
@@ -113,7 +113,7 @@ def compared(folder: Path, seed: int, size: Size) -> dict[str, Any]:
         return found, np.concatenate(ratios)
 
     base, _ = written(2)  # nothing is loaded yet: it is the starting policy that writes
-    curves = curves_of(base, reward, task, size)
+    curves = curves_of(reward.score(base), measures(base, task), size.pool)
     learner.load(load_state(saved.folder, "learner"))
     drawn, ratios = written(3)
     kl = float(ratios.mean())
@@ -143,10 +143,10 @@ def measures(responses: list[Response], task: TextTask) -> dict[str, Floats]:
     return found if fluent is None else found | {"fluency": np.asarray(fluent, float)}
 
 
-def curves_of(base: list[Response], reward: RewardModel[Response], task: TextTask, size: Size) -> dict[str, Floats]:
+def curves_of(judged: Floats, measured: dict[str, Floats], pool: int) -> dict[str, Floats]:
     """Each (N,): the best of 1, 2, ... N by the reward."""
-    judged = reward.score(base).reshape(-1, size.pool)
-    return {name: expected(judged, x.reshape(judged.shape)).mean(0) for name, x in measures(base, task).items()}
+    judged = judged.reshape(-1, pool)
+    return {name: expected(judged, x.reshape(judged.shape)).mean(0) for name, x in measured.items()}
 
 
 def account(rows: list[dict[str, Any]], short: bool) -> dict[str, Any]:
