@@ -26,6 +26,7 @@ from prefrl.components import ConfigError, Settings, missing
 from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
 from prefrl.improve.replay import cut, load_replay, relabel, replay_state
+from prefrl.improve.sb3_start import take_over
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
 from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.rollout import Act, Rollout, step_rewards
@@ -100,6 +101,9 @@ class SB3Settings(Settings):
     """Arguments of the algorithm (learning_rate, gamma, batch_size, ...), as its own documentation names them."""
     policy: dict[str, JsonValue] = Field(default_factory=dict)
     """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
+    start: Path | None = None
+    """A zip of the same algorithm, or a run with it, whose networks this one starts from; from the working directory
+    where it is relative. It needs the same widths and spaces; optimisers and what is replayed begin anew."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, without exploration, in environments of their own."""
     device: Device = "auto"
@@ -181,13 +185,23 @@ class SB3:
 
     def __init__(self, settings: SB3Settings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._known = settings, ALGORITHMS[settings.algorithm]
-        self._player = Player(task, settings.environments)
+        self._task, self._player = task, Player(task, settings.environments)
         self._env = TaskEnv(task, settings.environments)
         self._learned = LearnedReward(self._env, None)
         self._end = 0.0
         with seeded(rng):
-            self.model = _algorithm(settings, self._learned)
+            self._model = _algorithm(settings, self._learned)
         _check_steps(settings)
+        # Read when it is first needed: a run that goes on has networks of its own, and what it began with may be gone.
+        self._start = settings.start
+
+    @property
+    def model(self) -> Any:
+        """stable-baselines3's, with the networks that it starts from."""
+        start, self._start = self._start, None
+        if start is not None:
+            take_over(self._model, start, self._task)
+        return self._model
 
     @property
     def steps(self) -> Steps:
@@ -201,7 +215,8 @@ class SB3:
             self._player.explored(self._taken(rng))
         # Only the first round acts here; later ones cut what was done already.
         with nullcontext() if self._player.rounds else seeded(rng):
-            act = self._act(deterministic=False) if self._known.draws else self._random(rng)
+            shown = self._known.draws or self._settings.start is not None
+            act = self._act(deterministic=False) if shown else self._random(rng)
             return self._player.sample(count, act, rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
@@ -259,6 +274,7 @@ class SB3:
         return self._networks() | {"counters": counters, "replay": replay} | self._player.state()
 
     def load(self, state: State) -> None:
+        self._start = None
         self._load_networks(state)
         for name, value in state["counters"].items():
             setattr(self.model, name, value)

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, cast
 
-import numpy as np
 import yaml
 from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
 from prefrl.policies.heads import ActionSpace
-from prefrl.policies.zips import Bounds, read_zip, state_of
+from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, state_of
 from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.checkpoints import load_state, newest
 from prefrl.types import State
@@ -68,7 +67,7 @@ def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]
     parameters: Mapping[str, Tensor] = found.state["parameters"]
     there = [_sizes(parameters, net) for net in ("actor", "critic")]
     seen, acts = there[0][0], there[0][-1]
-    if (seen, acts) != (task.observation_size, task.action_size) or not _same(found.bounds, task.action_bounds):
+    if (seen, acts) != (task.observation_size, task.action_size) or not same_bounds(found.bounds, task.action_bounds):
         here = _told(task.observation_size, task.action_size, task.action_bounds)
         came = _told(seen, acts, found.bounds)
         raise ConfigError(
@@ -94,15 +93,8 @@ def _sizes(parameters: Mapping[str, Tensor], net: str) -> list[int]:
     return [int(weights[0].shape[1]), *(int(p.shape[0]) for p in weights)]
 
 
-def _same(a: Bounds | None, b: Bounds | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return all(np.allclose(x, y, rtol=1e-6) for x, y in zip(a, b, strict=True))
-
-
 def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
-    kind = "discrete actions" if bounds is None else f"actions from {bounds[0].tolist()} to {bounds[1].tolist()}"
-    return f"observations of {seen} numbers and {acts} {kind}"
+    return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
 __all__ = ["starting_state"]

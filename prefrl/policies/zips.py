@@ -112,33 +112,46 @@ def read_zip(path: Path) -> Zipped:
     That file holds `mean`, `var` and `count`, those of `VecNormalize`'s `obs_rms`. Raises `ValueError` for other
     policies than perceptrons with tanh, and for what cannot be read.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            said, version = json.loads(archive.read("data")), archive.read(VERSION).decode()
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: {WANTED}, and this is none ({error})") from error
+    said, version = read_words(path, WANTED)
     weights = _weights(path, version)
     _check(path, said, weights)
-    found = Zipped(weights, _bounds(path, said["action_space"]))
+    found = Zipped(weights, bounds_of(path, said["action_space"]))
     sizes = found.space.size, found.observation_size
     if found.bounds is not None and found.bounds[0].shape != (sizes[0],):
         raise ValueError(f"{path}: {WANTED}; its bounds do not fit its {sizes[0]} actions")
-    return Zipped(found.weights, found.bounds, _normaliser(path, sizes[1]))
+    return Zipped(found.weights, found.bounds, statistics_beside(path, sizes[1]))
+
+
+def read_words(path: Path, wanted: str) -> tuple[Json, str]:
+    """What a zip says of itself, and the version that it was saved by. Raises `ValueError` for what is no such zip."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return json.loads(archive.read("data")), archive.read(VERSION).decode()
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: {wanted}, and this is none ({error})") from error
 
 
 def _weights(path: Path, version: str) -> dict[str, Tensor]:
+    modules, _ = read_modules(path, version)
+    return {name: to_host(p) for name, p in modules.get("policy", {}).items() if isinstance(p, Tensor)}
+
+
+def read_modules(path: Path, version: str) -> tuple[State, State]:
+    """What a zip of any algorithm holds of networks and optimisers, and of single variables, by their names there.
+
+    Raises `ValueError` for what cannot be read.
+    """
     import stable_baselines3
     from stable_baselines3.common.save_util import load_from_zip_file
 
     try:
-        _, parts, _ = load_from_zip_file(path, load_data=False)  # without it nothing is unpickled but weights
+        _, modules, variables = load_from_zip_file(path, load_data=False)  # so nothing is unpickled but weights
     except Exception as error:  # torch raises many kinds of its own
         here = stable_baselines3.__version__
         raise ValueError(
             f"{path}: its weights cannot be read (saved by stable-baselines3 {version}, and here is {here}): {error}"
         ) from error
-    policy = parts.get("policy", {})
-    return {name: to_host(p) for name, p in policy.items() if isinstance(p, Tensor)}
+    return modules, variables or {}
 
 
 def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
@@ -156,7 +169,8 @@ def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
         raise ValueError(f"{path}: expected observations in one row of numbers (a Box), got {_told(space)}; {OTHERS}")
 
 
-def _bounds(path: Path, space: Any) -> Bounds | None:
+def bounds_of(path: Path, space: Any) -> Bounds | None:
+    """Of actions, as a zip says them in words; None of discrete ones. Raises `ValueError` for other spaces."""
     words = _words(space)
     if "discrete.Discrete" in words.get(":type:", "") and words.get("start") == "0":
         return None
@@ -169,6 +183,17 @@ def _bounds(path: Path, space: Any) -> Bounds | None:
     return low, high
 
 
+def same_bounds(a: Bounds | None, b: Bounds | None) -> bool:
+    """Of actions; None for discrete ones."""
+    if a is None or b is None:
+        return a is b
+    return all(np.shape(x) == np.shape(y) and np.allclose(x, y, rtol=1e-6) for x, y in zip(a, b, strict=True))
+
+
+def bounds_told(bounds: Bounds | None) -> str:
+    return "discrete actions" if bounds is None else f"actions from {bounds[0].tolist()} to {bounds[1].tolist()}"
+
+
 def _words(told: Any) -> dict[str, str]:
     """What `data` says of an object in words."""
     return {k: v for k, v in told.items() if isinstance(v, str)} if isinstance(told, dict) else {}
@@ -178,7 +203,7 @@ def _told(space: Mapping[str, str]) -> str:
     return f"{space.get(':type:', 'nothing')} of shape {space.get('_shape', 'unknown')}"
 
 
-def _normaliser(path: Path, size: int) -> State | None:
+def statistics_beside(path: Path, size: int) -> State | None:
     """Statistics that lie beside a zip. Raises `ValueError` for those of another size, and for pickled ones."""
     beside = path.with_suffix(".npz")
     if not beside.exists():
@@ -204,4 +229,14 @@ def _normaliser(path: Path, size: int) -> State | None:
     return {"mean": mean, "variance": variance, "count": float(count), "raw": False}
 
 
-__all__: Sequence[str] = ("Zipped", "read_zip", "state_of")
+__all__: Sequence[str] = (
+    "Zipped",
+    "bounds_of",
+    "bounds_told",
+    "read_modules",
+    "read_words",
+    "read_zip",
+    "same_bounds",
+    "state_of",
+    "statistics_beside",
+)
