@@ -145,12 +145,11 @@ class ControlLearnerSettings(Settings):
 
     @model_validator(mode="after")
     def _plain_start(self) -> ControlLearnerSettings:
-        network = self.policy
-        plain = isinstance(network, MLPPolicySettings) and (network.activation, network.critic_hidden) == ("tanh", None)
-        if self.start is not None and not plain:
+        plain = MLPPolicySettings().model_dump(exclude={"hidden", "initial_std"}).items()
+        if self.start is not None and not plain <= self.policy.model_dump().items():
             raise ValueError(
                 "start takes over a policy of kind mlp with tanh and one width for actor and critic: leave "
-                "learner.policy as it is, but for hidden"
+                "learner.policy as it is, but for hidden and initial_std"
             )
         return self
 

@@ -12,6 +12,7 @@ from gymnasium.spaces import Box, Space
 from stable_baselines3 import PPO
 from torch import Tensor
 
+from prefrl.components import ConfigError
 from prefrl.improve.vec_env import TaskEnv
 from prefrl.policies.mlp import MLPPolicy
 from prefrl.protocols import ControlTask
@@ -29,7 +30,10 @@ def save_ppo(policy: MLPPolicy, task: ControlTask, path: Path) -> None:
     """
     widths = {"pi": list(policy.widths["actor"]), "vf": list(policy.widths["critic"])}
     settings: dict[str, Any] = {"net_arch": widths, "activation_fn": ACTIVATIONS[policy.settings.activation]}
-    model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings)
+    if policy.space.squash:
+        _check_squash(policy)
+        settings["squash_output"] = True
+    model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings, use_sde=policy.settings.sde)
     model.observation_space = model.policy.observation_space = _observations(task, model.observation_space)
     model.policy.load_state_dict(_folded(policy))
     model.save(path)
@@ -46,6 +50,16 @@ def _observations(task: ControlTask, plain: Space[Any]) -> Space[Any]:
     return plain
 
 
+def _check_squash(policy: MLPPolicy) -> None:
+    """Raises `ConfigError` for what PPO cannot do: squash without gSDE, and where there are no bounds."""
+    clip = policy.space.clip
+    if not policy.settings.sde or clip is None or not np.isfinite(clip).all():
+        raise ConfigError(
+            "stable-baselines3's PPO squashes actions only together with sde, and only where all have bounds: train "
+            "with learner.policy.sde=true as well, or act with this policy through prefrl.load_policy"
+        )
+
+
 def _folded(policy: MLPPolicy) -> dict[str, Tensor]:
     """PPO's state, worked out in float64."""
     named: dict[str, Floats] = {k: to_numpy(p).astype(np.float64) for k, p in policy.named().items()}
@@ -56,7 +70,11 @@ def _folded(policy: MLPPolicy) -> dict[str, Tensor]:
         layers = [(named[f"{net}_{2 * i}"], named[f"{net}_{2 * i + 1}"]) for i in range(hidden + 1)]
         weight, bias = layers[0]
         layers[0] = weight * scale, bias - weight @ (mean * scale)
-        if net == "actor" and policy.space.middle is not None and policy.space.half is not None:
+        if net == "actor" and not policy.space.discrete:
+            found["log_std"] = named["log_std"]
+        # What is squashed PPO brings from [-1, 1] into the bounds by itself.
+        boxed = net == "actor" and not policy.space.squash
+        if boxed and policy.space.middle is not None and policy.space.half is not None:
             weight, bias = layers[-1]
             half = policy.space.half.astype(np.float64)
             layers[-1] = weight * half[:, None], bias * half + policy.space.middle

@@ -17,9 +17,9 @@ from pydantic import ConfigDict, Field
 from torch import Tensor
 from torch.nn.functional import conv2d, linear
 
-from prefrl.components import ConfigError, Settings
+from prefrl.components import ConfigError
 from prefrl.policies.acting import Decide, Decisions, Memory, Reading, copy_into
-from prefrl.policies.heads import ActionSpace, InitialStd, choose, density, starting_std
+from prefrl.policies.heads import ActionSpace, HeadSettings, Noise, choose, density, starting_std
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask
 from prefrl.seeding import generator, to_numpy
@@ -30,7 +30,7 @@ AT_ONCE = 512
 Count: TypeAlias = Annotated[int, Field(ge=1)]
 
 
-class CNNPolicySettings(Settings):
+class CNNPolicySettings(HeadSettings):
     """A convolutional network, with an actor and a critic on it: for pictures."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["image", "kind"]})
@@ -45,7 +45,6 @@ class CNNPolicySettings(Settings):
     """Units of the layer behind the convolutions."""
     brightest: float = Field(255.0, gt=0)
     """Pictures are divided by this."""
-    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> CNNPolicy:
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
@@ -70,7 +69,7 @@ class CNNPolicy:
     chunk = 1
 
     def __init__(self, settings: CNNPolicySettings, task: ControlTask, rng: np.random.Generator) -> None:
-        self.settings, self.space = settings, ActionSpace.of(task)
+        self.settings, self.space = settings, ActionSpace.of(task, settings)
         self._frames, rest = divmod(task.observation_size, math.prod(settings.image))
         if rest or not self._frames:
             raise ConfigError(
@@ -79,7 +78,7 @@ class CNNPolicy:
                 f"{task.observation_size}, which is no multiple; give the shape of the environment's own pictures"
             )
         named = _weights(settings, self._frames, task.action_size, generator(rng))
-        named |= starting_std(self.space, settings.initial_std)
+        named |= starting_std(self.space, settings, settings.width)
         self._p = torch.nn.ParameterDict(named.items())  # pairs: of a mapping it would not keep the order
 
     @property
@@ -96,14 +95,15 @@ class CNNPolicy:
         """Pictures are not normalised."""
 
     def decide(self) -> Decide:
-        std = to_numpy(self._p["log_std"].exp()) if "log_std" in self._p else None
+        noise = Noise(to_numpy(self._p["log_std"]), self.settings.sde_steps) if "log_std" in self._p else None
 
         def decide(
             observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
         ) -> tuple[Floats, Floats, Memory]:
             with torch.no_grad():
-                outputs = to_numpy(self._actor(self._features(torch.from_numpy(observations).to(self.device))))
-            return *choose(self.space, outputs, std, rng, legal), memory
+                features = self._features(torch.from_numpy(observations).to(self.device))
+                outputs = to_numpy(self._actor(features))
+            return *choose(self.space, outputs, to_numpy(features), noise, rng, legal), memory
 
         return decide
 
@@ -157,7 +157,7 @@ class CNNPolicy:
         return torch.cat([self._critic(self._features(some)) for some in parts]).squeeze(-1)
 
     def _density(self, features: Tensor, inputs: Decisions) -> tuple[Tensor, Tensor]:
-        return density(self._actor(features), inputs.choices, self._p.get("log_std"), inputs.legal)
+        return density(self._actor(features), inputs.choices, self._p.get("log_std"), inputs.legal, features)
 
 
 def _weights(settings: CNNPolicySettings, frames: int, actions: int, order: torch.Generator) -> dict[str, Tensor]:

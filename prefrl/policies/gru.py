@@ -14,8 +14,7 @@ import torch
 from pydantic import ConfigDict, Field
 from torch import Tensor
 
-from prefrl.components import Settings
-from prefrl.policies.heads import ActionSpace, InitialStd, starting_std
+from prefrl.policies.heads import ActionSpace, HeadSettings, starting_std
 from prefrl.policies.normaliser import Scaling
 from prefrl.policies.recurrence import recurrence, unit
 from prefrl.policies.remembering import BOTH, RememberingPolicy, Step, heads, orthogonal
@@ -24,7 +23,7 @@ from prefrl.seeding import generator, to_numpy
 from prefrl.types import Floats
 
 
-class GRUPolicySettings(Settings):
+class GRUPolicySettings(HeadSettings):
     """Recurrent networks, an actor and a critic: for worlds in which the past says what cannot be seen."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["kind"]})  # without one, settings are of an mlp
@@ -35,12 +34,12 @@ class GRUPolicySettings(Settings):
     """Units of the layer behind it."""
     chunk: int = Field(32, ge=2)
     """Steps through which the update goes back; what has to be remembered should fit into them."""
-    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> RememberingPolicy:
-        named = _weights(self, task, generator(rng)) | starting_std(ActionSpace.of(task), self.initial_std)
+        named = _weights(self, task, generator(rng))
+        named |= starting_std(ActionSpace.of(task, self), self, len(named["actor_weight"]))
         p = torch.nn.ParameterDict(named.items())  # pairs: of a mapping it would not keep the order
-        return RememberingPolicy(GRU(p, self.width), p, task, self.chunk)
+        return RememberingPolicy(GRU(p, self.width), p, task, self.chunk, self)
 
 
 class GRU:

@@ -14,9 +14,17 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from prefrl.components import Settings
 from prefrl.policies.acting import Decide, Decisions, Memory, Reading, copy_into
-from prefrl.policies.heads import ActionSpace, Categorical, Gaussian, InitialStd, choose, density, starting_std
+from prefrl.policies.heads import (
+    ActionSpace,
+    Categorical,
+    Gaussian,
+    HeadSettings,
+    Noise,
+    choose,
+    density,
+    starting_std,
+)
 from prefrl.policies.normaliser import Normaliser, Scaling
 from prefrl.policies.perceptron import Activation, Layers, activated, backward, forward
 from prefrl.policies.rollout import Rollout
@@ -25,7 +33,7 @@ from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, State
 
 
-class MLPPolicySettings(Settings):
+class MLPPolicySettings(HeadSettings):
     """Two perceptrons, an actor and a critic: for observations that say all there is to know."""
 
     kind: Literal["mlp"] = "mlp"
@@ -35,7 +43,6 @@ class MLPPolicySettings(Settings):
     """Widths of the critic's hidden layers; null for those of the actor."""
     activation: Activation = "tanh"
     """What follows each hidden layer."""
-    initial_std: InitialStd = 1.0
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> MLPPolicy:
         return MLPPolicy(self, task, rng)
@@ -48,16 +55,16 @@ class NumpyActor:
     space: ActionSpace
     layers: Layers
     activation: Activation
-    std: Floats | None
-    """(A,) of the noise; None where actions are discrete."""
+    noise: Noise | None
+    """None where actions are discrete."""
     scaling: Scaling
 
     def __call__(
         self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
     ) -> tuple[Floats, Floats]:
         """(n, O) -> choices (n, A) and actions to execute (n, A), as `choose` does."""
-        outputs, _ = forward(self.scaling(observations), self.layers, self.activation)
-        return choose(self.space, outputs, self.std, rng, legal)
+        outputs, trace = forward(self.scaling(observations), self.layers, self.activation)
+        return choose(self.space, outputs, trace.inputs[-1], self.noise, rng, legal)
 
 
 class Views(NamedTuple):
@@ -66,13 +73,13 @@ class Views(NamedTuple):
     actor: Layers
     critic: Layers
     log_std: Floats | None
-    """(A,)."""
+    """(A,), or (F, A) of F features."""
 
 
 class MLPPolicy:
     """A `prefrl.protocols.Policy` of `Decisions`: an actor and a critic, each an MLP.
 
-    For boxes the log standard deviation is a parameter of its own, the same in every state.
+    For boxes the log standard deviation is a parameter of its own, the same in every state, or one for each feature.
 
     Weights are orthogonal with gains sqrt(2), 0.01 for the actor's last layer and 1 for the critic's. All of them lie
     in one tensor: an optimiser's step and a gradient's norm are then one call each. Acting is NumPy, and on the CPU so
@@ -86,14 +93,14 @@ class MLPPolicy:
     ) -> None:
         """`learns_std`: false where the standard deviation stays what it is at first."""
         self._learns_std = learns_std
-        self.settings, self.space = settings, ActionSpace.of(task)
+        self.settings, self.space = settings, ActionSpace.of(task, settings)
         size, order = task.observation_size, generator(rng)
         of_critic = settings.hidden if settings.critic_hidden is None else settings.critic_hidden
         self.widths = {"actor": settings.hidden, "critic": of_critic}
         nets = {"actor": _mlp((size, *self.widths["actor"], task.action_size), 0.01, order)}
         nets["critic"] = _mlp((size, *self.widths["critic"], 1), 1.0, order)
         named = {f"{net}_{i}": p for net, parameters in nets.items() for i, p in enumerate(parameters)}
-        named |= starting_std(self.space, settings.initial_std)
+        named |= starting_std(self.space, settings, (size, *settings.hidden)[-1])
         self._shapes = {name: p.shape for name, p in named.items()}
         self._flat = torch.nn.Parameter(torch.cat([p.flatten() for p in named.values()]))
         self.to(self.device)
@@ -128,8 +135,8 @@ class MLPPolicy:
     def numpy_actor(self) -> NumpyActor:
         """What acts as the policy does now; it is not to be kept while the policy learns."""
         weights = self._views(self._flat)
-        std = None if weights.log_std is None else np.exp(weights.log_std)
-        return NumpyActor(self.space, weights.actor, self.settings.activation, std, self.normaliser.now())
+        noise = None if weights.log_std is None else Noise(weights.log_std, self.settings.sde_steps)
+        return NumpyActor(self.space, weights.actor, self.settings.activation, noise, self.normaliser.now())
 
     def decide(self) -> Decide:
         actor = self.numpy_actor()
@@ -151,33 +158,33 @@ class MLPPolicy:
 
     def log_prob(self, inputs: Decisions) -> tuple[Tensor, Tensor]:
         """Log-probabilities (B, 1) and entropies (B, 1), in nats."""
-        outputs = self._outputs("actor", inputs.observations)
+        features, outputs = self._outputs("actor", inputs.observations)
         log_std = self.named().get("log_std")
         if log_std is not None and not self._learns_std:
             log_std = log_std.detach()
-        return density(outputs, inputs.choices, log_std, inputs.legal)
+        return density(outputs, inputs.choices, log_std, inputs.legal, features)
 
     @property
     def peak(self) -> float:
-        """The log-density of the mode, the same in every state; 0 where actions are discrete, which have none."""
+        """The log-density of the mode, the same in every state without `sde`; 0 of discrete actions, that have none."""
         if self.space.discrete:
             return 0.0
         return -float(self.named()["log_std"].detach().sum()) - 0.5 * self.space.size * math.log(2 * math.pi)
 
     def values(self, inputs: Decisions) -> Tensor:
         """(B, 1)."""
-        return self._outputs("critic", inputs.observations)
+        return self._outputs("critic", inputs.observations)[1]
 
     def log_prob_and_values(self, inputs: Decisions) -> tuple[Tensor, Tensor, Tensor]:
         return *self.log_prob(inputs), self.values(inputs)
 
     def values_of(self, observations: Tensor) -> Tensor:
         """Normalised observations (..., O) -> (...)."""
-        return self._outputs("critic", observations).squeeze(-1)
+        return self._outputs("critic", observations)[1].squeeze(-1)
 
     @property
     def works_by_hand(self) -> bool:
-        return self._flat.is_cpu
+        return self._flat.is_cpu and not self.settings.sde
 
     def by_hand(self, inputs: Mapping[str, npt.NDArray[Any]], actor: bool, critic: bool) -> PassByHand:
         observations, traces = inputs["observations"], []
@@ -215,7 +222,8 @@ class MLPPolicy:
 
     def named(self) -> dict[str, Tensor]:
         """Every weight by its name, as torch lays layers out, (out, in) and (out,): views of what learns."""
-        return {name: part.T if part.dim() == 2 else part for name, part in self._parts(self._flat).items()}
+        parts = self._parts(self._flat).items()
+        return {name: part.T if part.dim() == 2 and name != "log_std" else part for name, part in parts}
 
     def _parts(self, flat: Tensor) -> dict[str, Tensor]:
         """(in, out) and (out,) of each layer: for products of rows, weights lie in memory like that."""
@@ -237,13 +245,13 @@ class MLPPolicy:
     def _names(self, net: str) -> list[str]:
         return [name for name in self._shapes if name.startswith(net)]
 
-    def _outputs(self, net: str, x: Tensor) -> Tensor:
-        """(..., O) -> (..., out) of the actor or the critic."""
+    def _outputs(self, net: str, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., O) -> the last hidden layer (..., F) of the actor or the critic, and what it says (..., out)."""
         parameters = self.named()
         *hidden, last_weight, last_bias = (parameters[name] for name in self._names(net))
         for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
             x = activated(torch.nn.functional.linear(x, weight, bias), self.settings.activation)
-        return torch.nn.functional.linear(x, last_weight, last_bias)
+        return x, torch.nn.functional.linear(x, last_weight, last_bias)
 
 
 def _mlp(sizes: tuple[int, ...], last_gain: float, order: torch.Generator) -> list[Tensor]:

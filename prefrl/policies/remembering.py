@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from prefrl.policies.acting import Decide, Memory, Reading, copy_into, in_chunks, on_device
-from prefrl.policies.heads import ActionSpace, choose, density
+from prefrl.policies.heads import ActionSpace, HeadSettings, Noise, choose, density
 from prefrl.policies.normaliser import Normaliser, Scaling
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask
@@ -83,10 +83,12 @@ class Chunks:
 class RememberingPolicy:
     """A `prefrl.policies.acting.ControlPolicy` of `Chunks`. Learning is automatic differentiation."""
 
-    def __init__(self, networks: Networks, p: torch.nn.ParameterDict, task: ControlTask, chunk: int) -> None:
+    def __init__(
+        self, networks: Networks, p: torch.nn.ParameterDict, task: ControlTask, chunk: int, settings: HeadSettings
+    ) -> None:
         """`p`: the weights of the networks, whose first layers are input_weight (2, O, out) and input_bias (2, 1, out),
         and of the heads on their features."""
-        self.chunk, self.space = chunk, ActionSpace.of(task)
+        self.chunk, self.space, self._settings = chunk, ActionSpace.of(task, settings), settings
         self._networks, self._p = networks, p
         self.normaliser = Normaliser(task.observation_size, calm=True)
 
@@ -109,14 +111,14 @@ class RememberingPolicy:
     def decide(self) -> Decide:
         step, size = self._networks.acting(self.normaliser.now()), self._networks.remembers
         weight, bias = to_numpy(self._p["actor_weight"]), to_numpy(self._p["actor_bias"])
-        std = np.exp(to_numpy(self._p["log_std"])) if "log_std" in self._p else None
+        noise = Noise(to_numpy(self._p["log_std"]), self._settings.sde_steps) if "log_std" in self._p else None
 
         def decide(
             observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
         ) -> tuple[Floats, Floats, Memory]:
             before = np.zeros((len(observations), size), np.float32) if memory is None else memory
             features, memory = step(observations, before)
-            return *choose(self.space, features @ weight + bias, std, rng, legal), memory
+            return *choose(self.space, features @ weight + bias, features, noise, rng, legal), memory
 
         return decide
 
@@ -174,7 +176,8 @@ class RememberingPolicy:
     def _density(self, features: Tensor, inputs: Chunks) -> tuple[Tensor, Tensor]:
         """(L, B, F) of the actor -> (B, L) log-probabilities and entropies."""
         outputs = (features @ self._p["actor_weight"] + self._p["actor_bias"]).transpose(0, 1)
-        logp, entropies = density(outputs, inputs.choices, self._p.get("log_std"), inputs.legal)
+        seen = features.transpose(0, 1)
+        logp, entropies = density(outputs, inputs.choices, self._p.get("log_std"), inputs.legal, seen)
         return torch.where(inputs.mask, logp.squeeze(-1), 0.0), torch.where(inputs.mask, entropies.squeeze(-1), 0.0)
 
 

@@ -35,8 +35,10 @@ def save_onnx(actor: NumpyActor, path: Path) -> None:
         graph.add("ArgMax", last, to="actions", axis=1, keepdims=0)
         output = helper.make_tensor_value_info("actions", TensorProto.INT64, ["n"])
     else:
-        last = graph.add("Max", graph.add("Min", last, space.clip), -space.clip)
-        graph.add("Add", graph.add("Mul", last, space.half), space.middle, to="actions")
+        within = graph.add("Max", graph.add("Min", last, space.clip), -space.clip)
+        if space.squash:
+            within = graph.add("Where", np.isfinite(space.clip), graph.add("Tanh", last), last)
+        graph.add("Add", graph.add("Mul", within, space.half), space.middle, to="actions")
         output = helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", space.size])
     given = helper.make_tensor_value_info("observations", TensorProto.FLOAT, ["n", size])
     made = helper.make_graph(graph.nodes, "policy", [given], [output], graph.constants)
@@ -63,9 +65,8 @@ class _Graph:
 
     def _constant(self, value: Floats) -> str:
         name = f"constant_{len(self.constants)}"
-        self.constants.append(
-            numpy_helper.from_array(np.ascontiguousarray(value, np.float32).reshape(np.shape(value)), name)
-        )
+        kind = bool if np.asarray(value).dtype == bool else np.float32
+        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value, kind).reshape(np.shape(value)), name))
         return name
 
 

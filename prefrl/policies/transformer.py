@@ -16,8 +16,7 @@ import torch
 from pydantic import ConfigDict, Field, model_validator
 from torch import Tensor
 
-from prefrl.components import Settings
-from prefrl.policies.heads import ActionSpace, InitialStd, starting_std
+from prefrl.policies.heads import ActionSpace, HeadSettings, starting_std
 from prefrl.policies.normaliser import Scaling
 from prefrl.policies.remembering import ACTOR, BOTH, RememberingPolicy, Step, heads, orthogonal
 from prefrl.protocols import ControlTask
@@ -25,7 +24,7 @@ from prefrl.seeding import generator, to_numpy
 from prefrl.types import Floats
 
 
-class TransformerPolicySettings(Settings):
+class TransformerPolicySettings(HeadSettings):
     """Causal transformers, an actor and a critic: for worlds in which the past says what cannot be seen."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["kind"]})  # without one, settings are of an mlp
@@ -42,7 +41,6 @@ class TransformerPolicySettings(Settings):
     """Units of the hidden layer behind the attention."""
     chunk: int = Field(32, ge=2)
     """Steps in a sequence of the update."""
-    initial_std: InitialStd = 1.0
 
     @model_validator(mode="after")
     def _whole_heads(self) -> TransformerPolicySettings:
@@ -51,9 +49,10 @@ class TransformerPolicySettings(Settings):
         return self
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> RememberingPolicy:
-        named = _weights(self, task, generator(rng)) | starting_std(ActionSpace.of(task), self.initial_std)
+        named = _weights(self, task, generator(rng))
+        named |= starting_std(ActionSpace.of(task, self), self, len(named["actor_weight"]))
         p = torch.nn.ParameterDict(named.items())  # pairs: of a mapping it would not keep the order
-        return RememberingPolicy(Transformer(p, self, task.observation_size), p, task, self.chunk)
+        return RememberingPolicy(Transformer(p, self, task.observation_size), p, task, self.chunk, self)
 
 
 class Transformer:

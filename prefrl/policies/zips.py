@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.policies.heads import ActionSpace
+from prefrl.policies.heads import ActionSpace, Noise
 from prefrl.policies.loaded import Loaded
 from prefrl.policies.mlp import NumpyActor
 from prefrl.policies.normaliser import CLIP, Scaling
@@ -64,10 +64,10 @@ class Zipped:
         layers = [
             (np.ascontiguousarray(named[f"actor_{2 * i}"].T), named[f"actor_{2 * i + 1}"][None]) for i in range(count)
         ]
-        std = None if self.bounds is None else np.exp(named["log_std"])
+        noise = None if self.bounds is None else Noise(named["log_std"])
         mean, scale = (x.astype(np.float32) for x in (state["mean"], 1.0 / np.sqrt(state["variance"] + 1e-8)))
         scaling = Scaling(mean, scale, np.inf if self.normaliser is None else CLIP)
-        return NumpyActor(self.space, layers, "tanh", std, scaling)
+        return NumpyActor(self.space, layers, "tanh", noise, scaling)
 
     def loaded(self) -> Loaded:
         """To act with."""

@@ -32,7 +32,7 @@ def test_numpy_acts_as_torch_would(env: str) -> None:
     (weights,) = policy.parameters()
     weights.data += 0.1 * torch.randn(weights.shape, generator=torch.Generator().manual_seed(0))
     observations = np.random.default_rng(3).normal(size=(9, len(policy.normaliser.mean))).astype(np.float32)
-    theirs = policy._outputs("actor", torch.from_numpy(policy.normalise(observations)))
+    theirs = policy._outputs("actor", torch.from_numpy(policy.normalise(observations)))[1]
     choices, actions = policy.numpy_actor()(observations, None)
     if env == "CartPole-v1":
         assert np.array_equal(choices.argmax(1), theirs.argmax(1).numpy())
@@ -45,7 +45,7 @@ def test_densities_and_entropies_are_those_of_torch_distributions() -> None:
     policy = _policy("Pendulum-v1")
     inputs, choices = torch.randn(7, 3), torch.randn(7, 1)
     logp, entropy = policy.log_prob(Decisions(inputs, choices))
-    normal = torch.distributions.Normal(policy._outputs("actor", inputs), policy.named()["log_std"].exp())
+    normal = torch.distributions.Normal(policy._outputs("actor", inputs)[1], policy.named()["log_std"].exp())
     torch.testing.assert_close(logp, normal.log_prob(choices))  # type: ignore[no-untyped-call]
     torch.testing.assert_close(entropy, normal.entropy())  # type: ignore[no-untyped-call]
 
@@ -86,7 +86,7 @@ def test_new_statistics_do_not_change_what_the_policy_does(env: str) -> None:
 
     def done() -> tuple[np.ndarray, np.ndarray]:
         inputs = torch.from_numpy(policy.normalise(observations))
-        return policy._outputs("actor", inputs).detach().numpy(), policy.values_of(inputs).detach().numpy()
+        return policy._outputs("actor", inputs)[1].detach().numpy(), policy.values_of(inputs).detach().numpy()
 
     before, mean, variance = done(), policy.normaliser.mean, policy.normaliser.variance
     policy.observe(rng.normal(3, 2, (40, size)))
@@ -142,7 +142,7 @@ def test_the_densities_of_legal_actions_are_those_of_a_choice_among_them_alone()
     _lean(policy, [0.0, 3.0, 0.5])
     choices = np.eye(3, dtype=np.float32)[[2, 0, 1]]
     logp, entropy = policy.log_prob(_three(choices))
-    outputs = policy._outputs("actor", torch.zeros(3, 1)).detach()
+    outputs = policy._outputs("actor", torch.zeros(3, 1))[1].detach()
     for i in range(3):
         alone = torch.distributions.Categorical(logits=outputs[i][torch.from_numpy(LEGAL[i])])
         place = int(LEGAL[i][: int(choices[i].argmax())].sum())

@@ -124,14 +124,14 @@ def test_nothing_that_is_pickled_in_a_zip_is_run(tmp_path: Path, monkeypatch: py
     np.testing.assert_array_equal(read_zip(tmp_path / "other.zip").actor()(SEEN, None)[1], there)
 
 
-@pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
-def test_onnx_acts_as_the_policy_does(env: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("env", "squash"), [("Pendulum-v1", False), ("Pendulum-v1", True), ("CartPole-v1", False)])
+def test_onnx_acts_as_the_policy_does(env: str, squash: bool, tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     from onnx.reference import ReferenceEvaluator
 
     from prefrl.policies.to_onnx import save_onnx
 
-    learner = ControlLearnerSettings(policy=MLPPolicySettings(hidden=(16, 8)), device="cpu").build(
+    learner = ControlLearnerSettings(policy=MLPPolicySettings(hidden=(16, 8), squash=squash), device="cpu").build(
         ControlSettings(env=env).build(), np.random.default_rng(0)
     )
     rng, size = np.random.default_rng(1), 3 if env == "Pendulum-v1" else 4
