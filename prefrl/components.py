@@ -137,6 +137,7 @@ EXTRAS = {
     "minari": "interchange",
     "onnx": "onnx",
     "submitit": "slurm",
+    "ray": "ray",
     "wandb": "wandb",
     "mlflow": "mlflow",
     "trackio": "trackio",

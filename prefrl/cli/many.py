@@ -25,7 +25,7 @@ def sweep(
         Path | None, typer.Option("--out", "-o", help="The folder of all runs; default: runs/ and the file's name.")
     ] = None,
     jobs: Jobs = 1,
-    launcher: Annotated[str, typer.Option(help="local, or submitit (Slurm).")] = "local",
+    launcher: Annotated[str, typer.Option(help="local, submitit (Slurm) or ray.")] = "local",
 ) -> None:
     """Run presets over seeds and a grid of settings. Run it again to go on where it stopped."""
     from prefrl.sweeps.plan import SweepPlan

