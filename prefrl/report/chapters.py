@@ -13,7 +13,7 @@ from prefrl.evaluate.summary import STAGES
 from prefrl.report import plots
 from prefrl.report.facts import Facts
 from prefrl.report.plots import Line, Series
-from prefrl.report.records import Record, whole
+from prefrl.report.records import Record
 from prefrl.stats.estimates import Estimate
 
 INTERVAL = 1.96
@@ -65,10 +65,6 @@ def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
     return tuple(chapter for chapter in found if chapter.cards)
 
 
-def _numbers(record: Record) -> list[int]:
-    return [whole(line["round"]) or 0 for line in record.rounds]
-
-
 def _known(values: Series) -> bool:
     return any(value is not None for value in values)
 
@@ -82,7 +78,7 @@ def _learning(record: Record, facts: Facts) -> tuple[Card, ...]:
 
 
 def _gold(record: Record) -> Card:
-    at, gold, spread = _numbers(record), record.series("evaluate/gold"), record.series("evaluate/gold_std")
+    at, gold, spread = record.numbers, record.series("evaluate/gold"), record.series("evaluate/gold_std")
     counts = record.series("evaluate/count")
     means = _known(counts)  # runs of before did not count
     width = [
@@ -149,13 +145,13 @@ def _learned_then(record: Record, facts: Facts) -> Card:
     )
     return Card(
         "Learned reward",
-        plots.lines("learned", _numbers(record), [Line(_learned(record), "learned", dash="--")]),
+        plots.lines("learned", record.numbers, [Line(record.learned, "learned", dash="--")]),
         f"What the policy was trained on. {scale}",
     )
 
 
 def _agreement(record: Record) -> Card:
-    learned = _in_hindsight(record)
+    learned = record.by_newest
     return Card(
         "Do the two agree?",
         plots.path("agreement", learned, record.series("evaluate/gold"), ("learned reward", "gold")),
@@ -164,25 +160,10 @@ def _agreement(record: Record) -> Card:
     )
 
 
-def _in_hindsight(record: Record) -> list[float | None]:
-    """The learned reward by round: by the newest reward where that was measured, else as each round's own said."""
-    if record.hindsight is None:
-        return _learned(record)
-    by_round = {seen.round: seen.learned.value for seen in record.hindsight.rounds}
-    return [by_round.get(number) for number in _numbers(record)]
-
-
-def _learned(record: Record) -> list[float | None]:
-    """The learned reward; what a model said before its first fit is noise, and left out."""
-    fits = [loss is not None for loss in record.series("fit/loss")]
-    first = fits.index(True) if True in fits else 0
-    return [value if i >= first else None for i, value in enumerate(record.series("evaluate/learned"))]
-
-
 def _drift(record: Record, facts: Facts) -> tuple[Card, ...]:
     if not facts.words.drifts and facts.kl is None:
         return ()
-    at = _numbers(record)
+    at = record.numbers
     kl, fluency, gold = (record.series(f"evaluate/{key}") for key in ("kl", "fluency", "gold"))
     return (
         Card(
@@ -207,7 +188,7 @@ def _drift(record: Record, facts: Facts) -> tuple[Card, ...]:
 def _gains(record: Record, kl: Series, gold: Series) -> Card:
     curves = [
         Line(_of_best_gain(gold), "gold", "gold"),
-        Line(_of_best_gain(_in_hindsight(record)), "learned", "learned reward", dash="--"),
+        Line(_of_best_gain(record.by_newest), "learned", "learned reward", dash="--"),
     ]
     return Card(
         "Over-optimisation",
@@ -225,7 +206,7 @@ def _of_best_gain(values: Series) -> list[float | None]:
 
 
 def _fitting(record: Record) -> tuple[Card, ...]:
-    at = _numbers(record)
+    at = record.numbers
 
     def both(name: str) -> list[Line]:
         held_out, training = record.series(f"fit/{name}_held_out"), record.series(f"fit/{name}")
@@ -261,14 +242,14 @@ def _training(record: Record) -> tuple[Card, ...]:
     """What the learner says of itself, where it says it and it changes."""
     found = {name: record.series(f"{TRAINING[name][0]}") for name in TRAINING}
     return tuple(
-        Card(name, plots.lines(f"training-{i}", _numbers(record), [Line(found[name], "improve")]), reading)
+        Card(name, plots.lines(f"training-{i}", record.numbers, [Line(found[name], "improve")]), reading)
         for i, (name, (_, reading)) in enumerate(TRAINING.items())
         if len({value for value in found[name] if value is not None}) > 1
     )
 
 
 def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
-    at = _numbers(record)
+    at = record.numbers
     seconds = {stage: record.series(f"seconds/{stage}") for stage in STAGES}
     labels = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
     steps = [("learn", "improve", "-"), ("query", "sample", "--"), ("evaluate", "evaluate", ":")]

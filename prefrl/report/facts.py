@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from prefrl.evaluate.summary import STAGES
 from prefrl.kinds import RESPONSES, SEGMENTS, Kind, find
 from prefrl.report.records import Record, mapping, number, visible, whole
 from prefrl.stats.estimates import Estimate
+
+FARTHER, MUCH_FARTHER = 0.5, 1.25
+"""Nats more, and how many times as many, that are not to be had for nothing."""
+
+
+class Drifted(NamedTuple):
+    """A policy that went on from the start, while its score did not rise."""
+
+    since: int
+    """The round with the best score."""
+    before: float
+    """Nats, after that round."""
+    now: float
 
 
 @dataclass(frozen=True)
@@ -35,6 +48,7 @@ class Facts:
     fluency: tuple[float | None, float | None]
     reward_accuracy: float | None
     kl: float | None
+    drifted: Drifted | None
     labels: Mapping[str, int | None]
     steps: Mapping[str, int | None]
     seconds: Mapping[str, float]
@@ -86,6 +100,7 @@ def gather(record: Record) -> Facts:
         ),
         reward_accuracy=first("reward_accuracy", last("fit/accuracy_held_out")),
         kl=first("kl", last("evaluate/kl")),
+        drifted=_drifted(record),
         labels=total("labels", ("asked", "answered", "skipped"), "label"),
         steps=total("steps", ("learn", "query", "evaluate"), "steps"),
         seconds=seconds,
@@ -103,6 +118,18 @@ def _fixed(record: Record) -> bool:
     """No round has fitted, and yet a reward had something to say."""
     fitted = any(value is not None for value in record.series("fit/loss"))
     return not fitted and any(value is not None for value in record.series("evaluate/learned"))
+
+
+def _drifted(record: Record) -> Drifted | None:
+    if record.hindsight is None and not _fixed(record):
+        return None  # each round's reward has a scale of its own
+    scored = zip(record.by_newest, record.series("evaluate/kl"), record.numbers, strict=True)
+    known = [(score, kl, number) for score, kl, number in scored if score is not None and kl is not None]
+    if len(known) < 2:
+        return None
+    (best, before, since), (score, now, _) = max(known[:-1]), known[-1]
+    farther = now > max(before + FARTHER, MUCH_FARTHER * before)
+    return Drifted(since, before, now) if farther and score <= best else None
 
 
 def _seconds(record: Record) -> dict[str, float]:

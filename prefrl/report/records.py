@@ -80,6 +80,26 @@ class Record:
     def last(self, key: str) -> float | None:
         return next((value for value in reversed(self.series(key)) if value is not None), None)
 
+    @property
+    def numbers(self) -> list[int]:
+        """Of the rounds."""
+        return [whole(line["round"]) or 0 for line in self.rounds]
+
+    @property
+    def learned(self) -> list[float | None]:
+        """The learned reward by round; what a model said before its first fit is noise, and left out."""
+        fits = [loss is not None for loss in self.series("fit/loss")]
+        first = fits.index(True) if True in fits else 0
+        return [value if i >= first else None for i, value in enumerate(self.series("evaluate/learned"))]
+
+    @property
+    def by_newest(self) -> list[float | None]:
+        """The same by the newest reward, where that was measured, else as each round's own said."""
+        if self.hindsight is None:
+            return self.learned
+        by_round = {seen.round: seen.learned.value for seen in self.hindsight.rounds}
+        return [by_round.get(number) for number in self.numbers]
+
 
 def read(folder: Path, examples: bool = True) -> Record:
     """Read a run's folder, with or without its examples. Raises `NotADirectoryError` when there is none; every file in

@@ -73,6 +73,12 @@ def verdict(facts: Facts) -> str:
         if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
     remarks += _wins(facts)
+    if facts.drifted is not None:
+        since, near, far = facts.drifted
+        remarks.append(
+            f"Since round {since} it went from {show_number(near)} to {show_number(far)} nats away from its start, and "
+            "its score did not rise: stop there, or make a nat dearer (learner.beta)."
+        )
     start, end = facts.fluency
     if start is not None and end is not None:
         if show_share(start) == show_share(end):

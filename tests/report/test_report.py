@@ -120,6 +120,36 @@ def test_a_whole_run_is_told_in_one_harmless_page(tmp_path: Path) -> None:
         assert word in found.text
 
 
+@pytest.mark.parametrize(
+    ("learned", "kl", "told"),
+    [
+        (
+            (0.0, 0.5, 0.9, 0.8),
+            (0.0, 1.0, 2.0, 4.0),
+            "Since round 2 it went from 2.00 to 4.00 nats away from its start",
+        ),
+        ((0.0, 0.5, 0.9, 0.9), (0.0, 1.0, 2.0, 4.0), "Since round 2"),
+        ((0.0, 0.5, 0.9, 1.0), (0.0, 1.0, 2.0, 4.0), ""),  # it rose
+        ((0.0, 0.5, 0.9, 0.8), (0.0, 1.0, 2.0, 2.2), ""),  # no farther
+        ((0.0, 0.5, 0.9, 0.8), (0.0, 1.0, 9.0, 10.0), ""),  # hardly farther
+    ],
+)
+def test_a_distance_that_grows_for_nothing_is_warned_of(
+    learned: tuple[float, ...], kl: tuple[float, ...], told: str, tmp_path: Path
+) -> None:
+    rounds = [{"evaluate/learned": a, "evaluate/kl": b} for a, b in zip(learned, kl, strict=True)]
+    fixed = [{k: v for k, v in (line(i) | one).items() if not k.startswith("fit/")} for i, one in enumerate(rounds)]
+    remark = verdict(gather(read(run_folder(tmp_path / "fixed", fixed))))
+    assert told in remark
+    assert ("did not rise" in remark) is bool(told)
+    # Each round's own reward has a scale of its own: nothing can be said of it, unless the newest scored them all.
+    fitted = [line(i) | one for i, one in enumerate(rounds)]
+    assert "did not rise" not in verdict(gather(read(run_folder(tmp_path / "fitted", fitted))))
+    seen = [{"round": i, "learned": {"value": x, "count": 9}, "won": {"count": 9}} for i, x in enumerate(learned)]
+    newest = run_folder(tmp_path / "newest", fitted, hindsight={"fitted_round": 3, "rounds": seen})
+    assert ("did not rise" in verdict(gather(read(newest)))) is bool(told)
+
+
 def test_text_runs_show_kl_and_fluency(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/kl": 2.0 * i, "evaluate/fluency": 1 - 0.1 * i}) for i in range(4)]
     said = {"kind": "text", "kl": 6.0, "fluency_before": 1.0, "fluency_after": 0.7}
