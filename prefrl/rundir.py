@@ -20,12 +20,12 @@ from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
-from prefrl.evaluate.hindsight import hindsight, keep
+from prefrl.evaluate.hindsight import hindsight, keep, keep_in, read_from
 from prefrl.evaluate.summary import read_metrics, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Noted, RewardModel, Task
 from prefrl.ranks import lead, rounds, shared
-from prefrl.report.examples import save_examples
+from prefrl.report.examples import save_examples, score_examples
 from prefrl.report.report import write_report
 from prefrl.report.trackers import Trackers
 from prefrl.seeding import streams
@@ -34,6 +34,8 @@ from prefrl.storage.files import DamagedError, verify, whole_folder, write_file
 from prefrl.store import Store
 from prefrl.types import Fitted, Json, Round
 
+OF_START = "examples/of-start"
+"""The starting policy's examples, for later rewards to score."""
 KEEP = 2
 """Checkpoints kept: if the newest is damaged, the one before it serves."""
 
@@ -121,6 +123,7 @@ class Run:
         config, loop = self.config, self.loop
         rng = streams(config.seed, 0).evaluate
         fits = [row["round"] for row in self._rows if row.get("fit/loss") is not None]
+        self._score_start()
         found = hindsight(self.folder, loop.round, fits[-1] if fits else None, loop.reward, rng)
         if found is not None:
             write_file(self.folder / HINDSIGHT, found.model_dump_json(indent=1).encode())
@@ -129,6 +132,12 @@ class Run:
             card = grade(subject, streams(config.seed, 0).evaluate)
             write_file(self.folder / "card.json", card.model_dump_json(indent=1).encode())
         return write_report(self.folder)
+
+    def _score_start(self) -> None:
+        """Before the first fit nothing could be said of the start's examples: the newest reward says it now."""
+        kept, reward = self.folder / OF_START, self.loop.reward
+        if kept.exists() and reward.fitted:
+            score_examples(self.folder, "before", reward.score(read_from(kept)))
 
     def _start_from(self, reward: Path | None) -> None:
         """Load the reward model that the run improves against, if there is one; keep it in the folder first."""
@@ -181,6 +190,8 @@ class Run:
         learned = reward.score(examples) if reward.fitted and examples else np.full(len(examples), np.nan)
         name = "after" if round.number else "before"
         save_examples(self.loop.task, examples, learned, self.folder, name)
+        if not round.number and examples:
+            keep_in(self.folder / OF_START, examples)
 
     def _checkpoint(self, number: int) -> None:
         with whole_folder(self.folder / "checkpoints" / f"round-{number:04d}") as folder:

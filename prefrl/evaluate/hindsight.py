@@ -30,6 +30,11 @@ MOST = 4_000_000
 
 def keep(folder: Path, number: int, candidates: Sequence[Candidate]) -> None:
     """Keep what a round's evaluation measured, in a run's folder. Gold and simulator states are left out."""
+    keep_in(_place(folder, number), candidates)
+
+
+def keep_in(place: Path, candidates: Sequence[Candidate]) -> None:
+    """Keep candidates in a folder of their own, to be scored again, as `keep` does."""
     kind = kind_of(candidates[0])
     bodies: list[Json] = []
     arrays: list[Arrays] = []
@@ -41,7 +46,7 @@ def keep(folder: Path, number: int, candidates: Sequence[Candidate]) -> None:
             break
         bodies.append(kind.describe(one))
         arrays.append(found)
-    with whole_folder(_place(folder, number)) as work:
+    with whole_folder(place) as work:
         save_state(work, "candidates", {"kind": kind.name, "bodies": bodies, "arrays": arrays})
 
 
@@ -66,7 +71,12 @@ def hindsight(
 
 def read(folder: Path, number: int) -> list[C]:
     """What was kept of a round. Raises `DamagedError` where it is not as it was written."""
-    state = load_state(_place(folder, number), "candidates")
+    return read_from(_place(folder, number))
+
+
+def read_from(place: Path) -> list[C]:
+    """What `keep_in` wrote. Raises `DamagedError` where it is not as it was written."""
+    state = load_state(place, "candidates")
     kind = named(state["kind"])
     pairs = zip(state["bodies"], state["arrays"], strict=True)
     return [kind.load(body, partial(dict, arrays)) for body, arrays in pairs]

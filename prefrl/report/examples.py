@@ -45,6 +45,15 @@ def save_examples(task: Task, examples: Sequence[Candidate], learned: Floats | N
     return path
 
 
+def score_examples(folder: Path, name: str, learned: Floats) -> None:
+    """Give the examples in `examples/<name>.json`, or the first of them, other learned scores."""
+    path = folder / "examples" / f"{name}.json"
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    for entry, score in zip(entries, learned, strict=False):
+        entry["learned"] = _finite(float(score))
+    write_file(path, json.dumps(entries, indent=1, allow_nan=False).encode())
+
+
 def strip(frames: np.ndarray, count: int = FRAMES) -> np.ndarray:
     """Evenly spaced frames of (T, H, W, 3) uint8, the first and the last among them, side by side with thin gaps."""
     at = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))

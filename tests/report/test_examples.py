@@ -1,15 +1,19 @@
 """What is kept of candidates for the report."""
 
 import json
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from prefrl.evaluate.hindsight import read_from
 from prefrl.report.examples import GAP, GREY, save_examples, strip
 from prefrl.report.records import read
+from prefrl.rundir import OF_START, Run, open_saved
 from prefrl.types import Response, Segment
 
 
@@ -77,3 +81,18 @@ def test_texts_are_kept_as_they_are_even_lone_surrogates(tmp_path: Path) -> None
 def test_scores_must_match_examples(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="one learned score for each of 1"):
         save_examples(Drawn(), [segment()], np.zeros(2), tmp_path, "after")
+
+
+@pytest.mark.parametrize("name", ["control/toy", "text/toy"])
+def test_examples_of_the_start_are_scored_by_the_newest_reward(
+    name: str, finished_tiny: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(finished_tiny[name], tmp_path / "run")
+    with Run.resume(folder) as run:
+        run.report()
+    saved = open_saved(folder)
+    start: list[Any] = read_from(folder / OF_START)
+    scores = saved.reward(saved.config.build_task()).score(start)
+    said = [entry["learned"] for entry in json.loads((folder / "examples" / "before.json").read_text())]
+    np.testing.assert_allclose(said, scores, rtol=1e-4, atol=1e-5)
+    assert all(one.gold is None for one in start)  # nothing that learns may see it
