@@ -16,6 +16,7 @@ from prefrl.report.plots import Line, Series
 from prefrl.report.records import Record
 from prefrl.stats.estimates import Estimate
 
+ROUNDING = 1e-9
 INTERVAL = 1.96
 """Standard errors on each side of a mean."""
 TRAINING = {
@@ -244,8 +245,14 @@ def _training(record: Record) -> tuple[Card, ...]:
     return tuple(
         Card(name, plots.lines(f"training-{i}", record.numbers, [Line(found[name], "improve")]), reading)
         for i, (name, (_, reading)) in enumerate(TRAINING.items())
-        if len({value for value in found[name] if value is not None}) > 1
+        if _changes(found[name])
     )
+
+
+def _changes(values: Series) -> bool:
+    """By more than rounding: the ratio of a single step is always 1, and its distance some 1e-13."""
+    known = [value for value in values if value is not None]
+    return bool(known) and max(known) - min(known) > ROUNDING
 
 
 def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:

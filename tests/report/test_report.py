@@ -150,6 +150,12 @@ def test_a_distance_that_grows_for_nothing_is_warned_of(
     assert ("did not rise" in verdict(gather(read(newest)))) is bool(told)
 
 
+@pytest.mark.parametrize(("size", "shown"), [(1e-13, False), (1e-3, True)])
+def test_a_number_that_changes_by_rounding_has_no_curve(size: float, shown: bool, tmp_path: Path) -> None:
+    lines = [line(i, **{"improve/kl_old": size * (1 + i)}) for i in range(4)]
+    assert ("Step size" in page(run_folder(tmp_path / "run", lines, summary=summary())).text) is shown
+
+
 def test_text_runs_show_kl_and_fluency(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/kl": 2.0 * i, "evaluate/fluency": 1 - 0.1 * i}) for i in range(4)]
     said = {"kind": "text", "kl": 6.0, "fluency_before": 1.0, "fluency_after": 0.7}
