@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,10 +123,10 @@ class Run:
         config, loop = self.config, self.loop
         rng = streams(config.seed, 0).evaluate
         fits = [row["round"] for row in self._rows if row.get("fit/loss") is not None]
-        self._score_start()
         found = hindsight(self.folder, loop.round, fits[-1] if fits else None, loop.reward, rng)
         if found is not None:
             write_file(self.folder / HINDSIGHT, found.model_dump_json(indent=1).encode())
+        self._score_start()
         subject = of_run(loop.reward, self.store, self.folder, loop.round, config.fitting, config.discount)
         if subject is not None:
             card = grade(subject, streams(config.seed, 0).evaluate)
@@ -136,7 +136,9 @@ class Run:
     def _score_start(self) -> None:
         """Before the first fit nothing could be said of the start's examples: the newest reward says it now."""
         kept, reward = self.folder / OF_START, self.loop.reward
-        if kept.exists() and reward.fitted:
+        if not kept.exists() or not reward.fitted:
+            return
+        with suppress(ValueError, TypeError, OSError):  # a report is made of what can be read, and says what cannot
             score_examples(self.folder, "before", reward.score(read_from(kept)))
 
     def _start_from(self, reward: Path | None) -> None:

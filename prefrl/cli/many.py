@@ -66,8 +66,8 @@ def drive_all(plan: SweepPlan, folder: Path, at_once: int, where: str) -> None:
     from prefrl.sweeps.drive import Sweep
     from prefrl.sweeps.launch import launcher
 
-    started, sweep, failed = launcher(where, folder / ".jobs"), Sweep(plan, folder), list[Path]()
-    left = len(sweep.jobs)
+    sweep, failed = Sweep(plan, folder), list[Path]()
+    started, left = launcher(where, folder / ".jobs"), len(sweep.jobs)
     say(f"the folder of the runs: {folder}")
     if left < len(sweep.members):
         say(f"{len(sweep.members) - left} of {len(sweep.members)} runs in {folder} are finished")

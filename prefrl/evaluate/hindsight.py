@@ -34,7 +34,7 @@ def keep(folder: Path, number: int, candidates: Sequence[Candidate]) -> None:
 
 
 def keep_in(place: Path, candidates: Sequence[Candidate]) -> None:
-    """Keep candidates in a folder of their own, to be scored again, as `keep` does."""
+    """Keep candidates in a folder of their own, to be scored again."""
     kind = kind_of(candidates[0])
     bodies: list[Json] = []
     arrays: list[Arrays] = []

@@ -44,6 +44,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "reinforce": {"clip": None, "epochs": 1, "trace": 1.0},
 }
 """Where their defaults are others than those of the fields below."""
+ITS_OWN = {"hidden", "initial_std", "squash", "sde", "sde_steps"}
+"""Settings of a policy that starts from another one, and that may be the other's."""
 MOVED = ("hidden", "initial_std")
 """Settings that were the learner's own once, and are its policy's."""
 SLOWER = 0.3
@@ -145,11 +147,11 @@ class ControlLearnerSettings(Settings):
 
     @model_validator(mode="after")
     def _plain_start(self) -> ControlLearnerSettings:
-        plain = MLPPolicySettings().model_dump(exclude={"hidden", "initial_std"}).items()
+        plain = MLPPolicySettings().model_dump(exclude=ITS_OWN).items()
         if self.start is not None and not plain <= self.policy.model_dump().items():
             raise ValueError(
                 "start takes over a policy of kind mlp with tanh and one width for actor and critic: leave "
-                "learner.policy as it is, but for hidden and initial_std"
+                f"learner.policy as it is, but for {', '.join(sorted(ITS_OWN))}"
             )
         return self
 
@@ -335,7 +337,7 @@ class ControlLearner:
         """Take over the policy that this one starts from, once."""
         if self._start is not None:
             assert isinstance(self._settings.policy, MLPPolicySettings)
-            self.policy.load(starting_state(self._start, self._task, self._settings.policy.hidden))
+            self.policy.load(starting_state(self._start, self._task, self._settings.policy))
             self._start = None
 
     def _rollout_lengths(self) -> list[int]:

@@ -198,9 +198,9 @@ class SB3:
     @property
     def model(self) -> Any:
         """stable-baselines3's, with the networks that it starts from."""
-        start, self._start = self._start, None
-        if start is not None:
-            take_over(self._model, start, self._task)
+        if self._start is not None:
+            take_over(self._model, self._start, self._task)
+            self._start = None
         return self._model
 
     @property

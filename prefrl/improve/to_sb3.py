@@ -33,7 +33,8 @@ def save_ppo(policy: MLPPolicy, task: ControlTask, path: Path) -> None:
     if policy.space.squash:
         _check_squash(policy)
         settings["squash_output"] = True
-    model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings, use_sde=policy.settings.sde)
+    noise = {"use_sde": policy.settings.sde, "sde_sample_freq": policy.settings.sde_steps or -1}
+    model = PPO("MlpPolicy", TaskEnv(task, 1), policy_kwargs=settings, **noise)
     model.observation_space = model.policy.observation_space = _observations(task, model.observation_space)
     model.policy.load_state_dict(_folded(policy))
     model.save(path)

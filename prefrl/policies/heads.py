@@ -36,7 +36,8 @@ class HeadSettings(Settings):
 
     kind: str = ""
     initial_std: float = Field(1.0, gt=0)
-    """Of the actions' noise at the start, in units of half the action bounds; with `sde` at the most."""
+    """Of the actions' noise at the start, in units of half the action bounds; with `sde` where all units of the last
+    hidden layer are at 1."""
     squash: bool = False
     """Whether bounded actions are the tanh of what was drawn, and not what was drawn clipped at the bounds. Learning
     goes by the probability of what was drawn: tanh's own part is the same in both policies of a ratio. So does the

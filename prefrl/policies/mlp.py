@@ -169,6 +169,7 @@ class MLPPolicy:
         """The log-density of the mode, the same in every state without `sde`; 0 of discrete actions, that have none."""
         if self.space.discrete:
             return 0.0
+        assert not self.settings.sde
         return -float(self.named()["log_std"].detach().sum()) - 0.5 * self.space.size * math.log(2 * math.pi)
 
     def values(self, inputs: Decisions) -> Tensor:

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
 from prefrl.policies.heads import ActionSpace
-from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, state_of
+from prefrl.policies.mlp import MLPPolicySettings
+from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, squashes, state_of
 from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.checkpoints import load_state, newest
-from prefrl.types import State
+from prefrl.types import Json, State
 
 OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and PPO, A2C or TRPO"
 
@@ -22,12 +23,13 @@ OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and
 class _Found(NamedTuple):
     state: State
     bounds: Bounds | None
+    squash: bool
 
 
-def starting_state(path: Path, task: ControlTask, hidden: tuple[int, ...]) -> State:
+def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings) -> State:
     """What `MLPPolicy.load` reads: the last policy of a run, or that of a zip (`read_zip`).
 
-    Raises `ConfigError` for a policy of other spaces or widths, and for what is no policy of control.
+    Raises `ConfigError` for a policy of other spaces, widths or noise, and for what is no policy of control.
     """
     if not path.exists():
         raise ConfigError(
@@ -39,13 +41,14 @@ def starting_state(path: Path, task: ControlTask, hidden: tuple[int, ...]) -> St
         raise
     except ValueError as error:
         raise ConfigError(f"learner.start: {error}") from error
-    _check(found, path, task, hidden)
+    _check(found, path, task, settings.hidden)
+    _check_noise(found, path, settings)
     return found.state
 
 
 def _of_zip(path: Path) -> _Found:
     zipped = read_zip(path)
-    return _Found(zipped.state(), zipped.bounds)
+    return _Found(zipped.state(), zipped.bounds, zipped.squash)
 
 
 def _of_run(folder: Path) -> _Found:
@@ -58,9 +61,15 @@ def _of_run(folder: Path) -> _Found:
         raise ConfigError(f"learner.start: {folder} has another network, {network}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
         raise ConfigError(f"learner.start: {folder} holds no policy of control that can be taken over; expected {OURS}")
+    task, squash = task_of(said), squashes(said["learner"])
+    space = ActionSpace.within(task.action_size, task.action_bounds, squash)
+    return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash)
+
+
+def task_of(said: Json) -> ControlTask:
+    """The task of a run, from its saved settings."""
     settings = settings_class("tasks", said["task"]["kind"]).model_validate(said["task"])
-    task = cast(ControlTask, cast(TaskSettings, settings).build())
-    return _Found(ours if "mean" in ours else state_of(theirs, ActionSpace.of(task)), task.action_bounds)
+    return cast(ControlTask, cast(TaskSettings, settings).build())
 
 
 def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]) -> None:
@@ -87,6 +96,16 @@ def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]
         )
 
 
+def _check_noise(found: _Found, path: Path, settings: MLPPolicySettings) -> None:
+    log_std = found.state["parameters"].get("log_std")
+    there = {"squash": found.squash, "sde": log_std is not None and log_std.dim() == 2}
+    for name, value in there.items():
+        if value != getattr(settings, name):
+            raise ConfigError(
+                f"learner.start: the policy of {path} has learner.policy.{name}={str(value).lower()}: set it so"
+            )
+
+
 def _sizes(parameters: Mapping[str, Tensor], net: str) -> list[int]:
     """Of a network's layers, from the observation to what it gives."""
     weights = [p for name, p in parameters.items() if name.startswith(net) and p.dim() == 2]
@@ -97,4 +116,4 @@ def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
     return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
-__all__ = ["starting_state"]
+__all__ = ["starting_state", "task_of"]

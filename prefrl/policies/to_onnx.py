@@ -35,9 +35,10 @@ def save_onnx(actor: NumpyActor, path: Path) -> None:
         graph.add("ArgMax", last, to="actions", axis=1, keepdims=0)
         output = helper.make_tensor_value_info("actions", TensorProto.INT64, ["n"])
     else:
-        within = graph.add("Max", graph.add("Min", last, space.clip), -space.clip)
         if space.squash:
             within = graph.add("Where", np.isfinite(space.clip), graph.add("Tanh", last), last)
+        else:
+            within = graph.add("Max", graph.add("Min", last, space.clip), -space.clip)
         graph.add("Add", graph.add("Mul", within, space.half), space.middle, to="actions")
         output = helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", space.size])
     given = helper.make_tensor_value_info("observations", TensorProto.FLOAT, ["n", size])

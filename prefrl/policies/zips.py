@@ -44,10 +44,14 @@ class Zipped:
     """(low (A,), high (A,)), or None where actions are discrete."""
     normaliser: State | None = None
     """`mean` (O,), `variance` (O,) and `count`; None where observations are seen as they are."""
+    squash: bool = False
+    """Whether actions are the tanh of what is drawn."""
+    noise_steps: int = 1
+    """After how many steps noise that is a function of the state is drawn anew."""
 
     @property
     def space(self) -> ActionSpace:
-        return ActionSpace.within(len(self.weights["action_net.bias"]), self.bounds)
+        return ActionSpace.within(len(self.weights["action_net.bias"]), self.bounds, self.squash)
 
     @property
     def observation_size(self) -> int:
@@ -64,7 +68,7 @@ class Zipped:
         layers = [
             (np.ascontiguousarray(named[f"actor_{2 * i}"].T), named[f"actor_{2 * i + 1}"][None]) for i in range(count)
         ]
-        noise = None if self.bounds is None else Noise(named["log_std"])
+        noise = None if self.bounds is None else Noise(named["log_std"], self.noise_steps)
         mean, scale = (x.astype(np.float32) for x in (state["mean"], 1.0 / np.sqrt(state["variance"] + 1e-8)))
         scaling = Scaling(mean, scale, np.inf if self.normaliser is None else CLIP)
         return NumpyActor(self.space, layers, "tanh", noise, scaling)
@@ -92,9 +96,11 @@ def state_of(weights: Mapping[str, Tensor], space: ActionSpace) -> State:
             [to_numpy(weights[f"{name}.{part}"]).astype(np.float64) for part in ("weight", "bias")] for name in names
         ]
         if net == "actor" and space.middle is not None and space.half is not None:
-            weight, bias = layers[-1]
-            layers[-1] = [weight / space.half[:, None], (bias - space.middle) / space.half]
-            found["log_std"] = to_numpy(weights["log_std"]) - np.log(space.half)
+            found["log_std"] = to_numpy(weights["log_std"])
+            if not space.squash:  # what is squashed lies in [-1, 1] there too
+                weight, bias = layers[-1]
+                layers[-1] = [weight / space.half[:, None], (bias - space.middle) / space.half]
+                found["log_std"] = found["log_std"] - np.log(space.half)
         found |= {f"{net}_{i}": x for i, x in enumerate(x for layer in layers for x in layer)}
     parameters = {name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in found.items()}
     size = parameters["actor_0"].shape[1]
@@ -115,20 +121,32 @@ def read_zip(path: Path) -> Zipped:
     said, version = read_words(path, WANTED)
     weights = _weights(path, version)
     _check(path, said, weights)
-    found = Zipped(weights, bounds_of(path, said["action_space"]))
+    found = Zipped(weights, bounds_of(path, said.get("action_space")))
     sizes = found.space.size, found.observation_size
     if found.bounds is not None and found.bounds[0].shape != (sizes[0],):
         raise ValueError(f"{path}: {WANTED}; its bounds do not fit its {sizes[0]} actions")
-    return Zipped(found.weights, found.bounds, statistics_beside(path, sizes[1]))
+    # Steps that are -1 there are a rollout, and here there is none.
+    steps = said.get("sde_sample_freq")
+    steps = steps if isinstance(steps, int) and steps > 0 else 1
+    return Zipped(found.weights, found.bounds, statistics_beside(path, sizes[1]), squashes(said), steps)
+
+
+def squashes(said: Json) -> bool:
+    """Whether actions are the tanh of what is drawn, by a zip's words, or by a run's `learner`."""
+    kwargs = said.get("policy_kwargs", said.get("policy"))
+    return isinstance(kwargs, dict) and bool(kwargs.get("squash_output", kwargs.get("squash")))
 
 
 def read_words(path: Path, wanted: str) -> tuple[Json, str]:
     """What a zip says of itself, and the version that it was saved by. Raises `ValueError` for what is no such zip."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return json.loads(archive.read("data")), archive.read(VERSION).decode()
+            said, version = json.loads(archive.read("data")), archive.read(VERSION).decode()
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise ValueError(f"{path}: {wanted}, and this is none ({error})") from error
+    if not isinstance(said, dict):
+        raise ValueError(f"{path}: {wanted}, and this is none (its `data` is no object)")
+    return said, version
 
 
 def _weights(path: Path, version: str) -> dict[str, Tensor]:
@@ -151,7 +169,15 @@ def read_modules(path: Path, version: str) -> tuple[State, State]:
         raise ValueError(
             f"{path}: its weights cannot be read (saved by stable-baselines3 {version}, and here is {here}): {error}"
         ) from error
+    if not all(isinstance(one, Mapping) for one in modules.values()):
+        raise ValueError(f"{path}: its weights cannot be read: expected a mapping of tensors in each of its files")
     return modules, variables or {}
+
+
+def activation_of(said: Json, default: str) -> str:
+    """The name of the activation that a zip's words have, as torch has it; `default` where they have none."""
+    found: list[str] = re.findall(r"\w+", _words(said.get("policy_kwargs")).get("activation_fn", ""))
+    return found[-1] if found else default
 
 
 def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
@@ -161,9 +187,12 @@ def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
     if strange or not _hidden_layers(weights, "policy_net") or not _hidden_layers(weights, "value_net"):
         came = f"a layer {strange[0]!r}" if strange else "no hidden layers"
         raise ValueError(f"{path}: {WANTED}, and this policy has {came}; {OTHERS}")
-    activation = re.findall(r"\w+", _words(said.get("policy_kwargs")).get("activation_fn", "Tanh"))[-1]
+    activation = activation_of(said, "Tanh")
     if activation != "Tanh":
         raise ValueError(f"{path}: expected a policy with tanh, and this one has {activation}; {OTHERS}")
+    kwargs = said.get("policy_kwargs")
+    if isinstance(kwargs, dict) and (kwargs.get("use_expln") or kwargs.get("full_std") is False):
+        raise ValueError(f"{path}: {WANTED}, and this policy has use_expln, or not full_std; {OTHERS}")
     space = _words(said.get("observation_space"))
     if "Box" not in space.get(":type:", "") or "," in space.get("_shape", ""):
         raise ValueError(f"{path}: expected observations in one row of numbers (a Box), got {_told(space)}; {OTHERS}")
@@ -231,12 +260,14 @@ def statistics_beside(path: Path, size: int) -> State | None:
 
 __all__: Sequence[str] = (
     "Zipped",
+    "activation_of",
     "bounds_of",
     "bounds_told",
     "read_modules",
     "read_words",
     "read_zip",
     "same_bounds",
+    "squashes",
     "state_of",
     "statistics_beside",
 )

@@ -127,7 +127,7 @@ def _drifted(record: Record) -> Drifted | None:
     known = [(score, kl, number) for score, kl, number in scored if score is not None and kl is not None]
     if len(known) < 2:
         return None
-    (best, before, since), (score, now, _) = max(known[:-1]), known[-1]
+    (best, before, since), (score, now, _) = max(known[:-1], key=lambda one: (one[0], -one[1])), known[-1]
     farther = now > max(before + FARTHER, MUCH_FARTHER * before)
     return Drifted(since, before, now) if farther and score <= best else None
 

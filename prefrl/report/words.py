@@ -77,7 +77,7 @@ def verdict(facts: Facts) -> str:
         since, near, far = facts.drifted
         remarks.append(
             f"Since round {since} it went from {show_number(near)} to {show_number(far)} nats away from its start, and "
-            "its score did not rise: stop there, or make a nat dearer (learner.beta)."
+            "its learned score did not rise: that round has the better policy, or hold it nearer to its start."
         )
     start, end = facts.fluency
     if start is not None and end is not None:

@@ -130,7 +130,10 @@ class Submitit:
 
 
 class Ray:
-    """Tasks of Ray, one CPU each: on the cluster that `RAY_ADDRESS` names, else on one that is started here."""
+    """Tasks of Ray, one CPU each: on the cluster that `RAY_ADDRESS` names, else on one that is started here.
+
+    Raises `ConfigError` where there is no cluster at that address.
+    """
 
     def __init__(self) -> None:
         import ray
@@ -139,8 +142,13 @@ class Ray:
         # Of a cluster that is started here: Ray reports its use by default, and has its workers stand back.
         for name in ("RAY_USAGE_STATS_ENABLED", "RAY_worker_niceness"):
             os.environ.setdefault(name, "0")
+        where = os.environ.get("RAY_ADDRESS") or "local"  # else it would join any cluster that was started here
         # Nothing of the driver's environment is taken along: nodes have prefrl, and see the folder, as with Slurm.
-        ray.init(include_dashboard=False, log_to_driver=False, configure_logging=False)
+        own: dict[str, Any] = {"include_dashboard": False} if where == "local" else {}
+        try:
+            ray.init(where, log_to_driver=False, configure_logging=False, **own)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise ConfigError(f"--launcher ray: there is no cluster at RAY_ADDRESS={where}: {error}") from error
         self._called = ray.remote(num_cpus=1, max_retries=0)(_called)
         self._running: set[Any] = set()
         self._lock, self._stopped = threading.Lock(), False
@@ -153,7 +161,10 @@ class Ray:
             self._running.add(sent)
         try:
             return int(self._ray.get(sent))
-        except self._ray.exceptions.RayError:  # cancelled, or its node is gone: the folder says how far it came
+        except self._ray.exceptions.RayError as error:  # its node is gone, say: the folder tells how far it came
+            if not self._stopped:
+                with job.log.open("a", encoding="utf-8") as log:
+                    log.write(f"Ray: {error}\n")
             return 1
         finally:
             self._running.discard(sent)
@@ -173,15 +184,17 @@ class Ray:
 def _called(command: list[str], log: str, place: str) -> int:
     """On a node: run a command in a working directory, to its end, or stop it in good order where this is stopped."""
     with open(log, "ab") as file:
-        with _heard():
-            process = _started(command, file, place)
+        process = None
         try:
+            with _heard():
+                process = _started(command, file, place)
             while process.poll() is None:  # Ray interrupts Python alone, and not a call that waits
                 time.sleep(0.2)
             return process.returncode
         finally:
-            process.send_signal(signal.SIGINT)  # does nothing where it has ended
-            _end(process, time.monotonic() + STOPPING)
+            if process is not None:
+                process.send_signal(signal.SIGINT)  # does nothing where it has ended
+                _end(process, time.monotonic() + STOPPING)
 
 
 @contextmanager

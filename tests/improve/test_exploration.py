@@ -18,6 +18,7 @@ from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.improve.to_sb3 import save_ppo
 from prefrl.policies.heads import ActionSpace, Noise, density
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
+from prefrl.policies.zips import read_zip
 from prefrl.store import Store
 from prefrl.types import Segment
 
@@ -129,8 +130,38 @@ def test_a_zip_of_stable_baselines3_does_not_squash_other_noise(tmp_path: Path) 
         save_ppo(policy, task, tmp_path / "policy.zip")
 
 
-def test_a_policy_of_another_exploration_is_no_start() -> None:
-    for settings in ({"sde": True}, {"squash": True}):
-        with pytest.raises(ValueError, match=r"leave learner\.policy as it is"):
+@pytest.mark.parametrize("squash", [False, True])
+def test_such_a_zip_acts_and_starts_here_as_it_does_there(squash: bool, tmp_path: Path) -> None:
+    noise = {"use_sde": True, "sde_sample_freq": 3}
+    kwargs = {"net_arch": [8], "squash_output": squash}
+    model = PPO("MlpPolicy", "Pendulum-v1", policy_kwargs=dict(kwargs), seed=0, **noise)
+    model.policy.action_net.weight.data.mul_(300)
+    model.save(tmp_path / "policy.zip")
+    seen = np.random.default_rng(1).normal(0.0, 1.0, (40, 3)).astype(np.float32)
+    expected = model.predict(seen, deterministic=True)[0]
+    zipped = read_zip(tmp_path / "policy.zip")
+    assert (zipped.squash, zipped.noise_steps) == (squash, 3)
+    np.testing.assert_allclose(zipped.loaded().predict(seen)[0], expected, atol=1e-5)
+    task = ControlSettings(env="Pendulum-v1").build()
+    policy = {"hidden": [8], "sde": True, "squash": squash}
+    settings = ControlLearnerSettings.model_validate({"start": tmp_path / "policy.zip", "policy": policy})
+    started = settings.build(task, np.random.default_rng(0))
+    np.testing.assert_allclose(started.actor()(seen, None, None)[0], expected, atol=1e-5)
+    for name in ("sde", *(["squash"] if squash else [])):
+        other = settings.model_copy(update={"policy": settings.policy.model_copy(update={name: False})})
+        with pytest.raises(ConfigError, match=rf"has learner\.policy\.{name}=true: set it so"):
+            other.build(task, np.random.default_rng(0)).actor()
+
+
+def test_a_zip_with_noise_of_another_kind_is_refused(tmp_path: Path) -> None:
+    for name, kwargs in (("a", {"use_expln": True}), ("b", {"full_std": False})):
+        PPO("MlpPolicy", "Pendulum-v1", policy_kwargs=kwargs, use_sde=True).save(tmp_path / f"{name}.zip")
+        with pytest.raises(ValueError, match="use_expln, or not full_std"):
+            read_zip(tmp_path / f"{name}.zip")
+
+
+def test_a_policy_with_a_memory_or_other_units_is_no_start() -> None:
+    for settings in ({"kind": "gru"}, {"activation": "relu"}, {"critic_hidden": [8]}):
+        with pytest.raises(ValueError, match=r"leave learner\.policy as it is, but for hidden, initial_std, sde"):
             ControlLearnerSettings.model_validate({"start": "policy.zip", "policy": settings})
     ControlLearnerSettings.model_validate({"start": "policy.zip", "policy": {"hidden": [8], "initial_std": 0.5}})

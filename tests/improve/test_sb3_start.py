@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 
 from prefrl.components import ConfigError
 from prefrl.config import Config
@@ -91,9 +93,43 @@ def test_a_run_with_the_same_algorithm_is_a_start_and_one_of_another_kind_says_h
     started = settings.build(task, np.random.default_rng(5)).model.policy.state_dict()
     finished = load_state(newest(tmp_path / "run")[0], "learner")["modules"]["policy"]
     assert all(torch.equal(started[name], value) for name, value in finished.items())
+    a2c = settings.model_copy(
+        update={"start": tmp_path / "run", "algorithm": "A2C", "options": {}, "steps_per_round": 160}
+    )
+    with pytest.raises(ConfigError, match=r"is a run with learner\.kind=sb3, learner\.algorithm=PPO"):
+        _ = a2c.build(task, np.random.default_rng(5)).model
     other = settings.model_copy(update={"start": finished_tiny["control/toy"]})
-    with pytest.raises(ConfigError, match=r"learner\.kind=control: what it learned is a zip after `prefrl export"):
+    with pytest.raises(
+        ConfigError, match=r"learner\.kind=control, learner\.algorithm=ppo \(of a run of control `prefrl export"
+    ):
         _ = other.build(task, np.random.default_rng(5)).model
+
+
+def test_what_weights_do_not_show_is_refused(zipped: Path, tmp_path: Path) -> None:
+    SAC("MlpPolicy", TaskEnv(point(), 1), policy_kwargs=NET | {"activation_fn": torch.nn.Tanh}).save(tmp_path / "tanh")
+    with pytest.raises(ConfigError, match=r"tanh\.zip have Tanh, and those of SAC here have ReLU"):
+        _ = build(point(), start=tmp_path / "tanh.zip").model
+    ppo: dict[str, Any] = {"algorithm": "PPO", "options": {"n_steps": 20, "use_sde": True, "batch_size": 40}}
+    PPO("MlpPolicy", TaskEnv(point(), 1), policy_kwargs=NET | {"squash_output": True}, use_sde=True).save(
+        tmp_path / "squashed"
+    )
+    with pytest.raises(ConfigError, match=r"squash_output=True: set learner\.policy\.squash_output"):
+        _ = build(point(), start=tmp_path / "squashed.zip", **ppo).model
+    wide = replace(point(), action_bounds=(np.array([-20.0], np.float32), np.array([20.0], np.float32)))
+    with pytest.raises(ConfigError, match=r"expected a policy for .*\[20\.0\].*policy\.zip has one with"):
+        _ = build(wide, start=zipped).model
+
+
+def test_a_start_that_cannot_be_read_is_refused_each_time(zipped: Path, tmp_path: Path) -> None:
+    for number, data in enumerate(("[1]", "{}")):
+        path = tmp_path / f"{number}.zip"
+        with zipfile.ZipFile(zipped) as old, zipfile.ZipFile(path, "w") as new:
+            for name in old.namelist():
+                new.writestr(name, data if name == "data" else old.read(name))
+        learner = build(point(), start=path)
+        for _ in range(2):
+            with pytest.raises(ConfigError, match=rf"learner\.start: .*{number}\.zip"):
+                _ = learner.model
 
 
 def test_what_is_no_start_is_refused_and_says_what_to_do(zipped: Path, tmp_path: Path) -> None:

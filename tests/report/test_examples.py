@@ -96,3 +96,19 @@ def test_examples_of_the_start_are_scored_by_the_newest_reward(
     said = [entry["learned"] for entry in json.loads((folder / "examples" / "before.json").read_text())]
     np.testing.assert_allclose(said, scores, rtol=1e-4, atol=1e-5)
     assert all(one.gold is None for one in start)  # nothing that learns may see it
+
+
+@pytest.mark.parametrize("said", ["garbage", "[1, 2]", "{}", None])
+def test_a_report_is_made_whatever_became_of_the_examples(
+    said: str | None, finished_tiny: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(finished_tiny["control/toy"], tmp_path / "run")
+    before = folder / "examples" / "before.json"
+    if said is None:
+        shutil.rmtree(folder / OF_START)
+        (folder / OF_START).mkdir()
+    else:
+        before.write_text(said)
+    with Run.resume(folder) as run:
+        assert run.report().exists()
+    assert said is None or before.read_text() == said

@@ -18,7 +18,7 @@ from prefrl.rundir import RunError, finished
 from prefrl.storage.engines import disown, own, owned
 from prefrl.sweeps.drive import Ended, Sweep
 from prefrl.sweeps.launch import Job, Launcher, Local, Ray, Submitit, launcher
-from prefrl.sweeps.plan import SweepPlan
+from prefrl.sweeps.plan import Member, SweepPlan
 
 SMALL = ("loop.rounds=1", "loop.labels=20", "learner.steps_per_round=640", "learner.evaluation_episodes=2")
 
@@ -139,6 +139,8 @@ def test_a_sweep_that_is_killed_ends_in_the_same_digits_wherever_its_runs_are_st
     assert [ended.status for ended in sent.run(Submitit(tmp_path / "jobs"), 1)] == [0]
     tasks = Sweep(plan, tmp_path / "tasks")
     ray = Ray()
+    assert ray.call(Job(Member("no", "no\0preset", ()), tmp_path / "no", tmp_path / "no.log")) == 1
+    assert "embedded null byte" in (tmp_path / "no.log").read_text()
     assert [ended.status for ended in tasks.run(ray, 1)] == [0]
     for member in whole.members:
         rows = [
