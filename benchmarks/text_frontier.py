@@ -56,7 +56,6 @@ ON_FILMS: Runs = {
     "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),
     "REINFORCE": ("text/imdb", (*FILMS, "learner.algorithm=reinforce")),
     "PPO": ("text/imdb", (*FILMS, "learner.algorithm=ppo", "learner.epochs=2")),
-    "online DPO": ("text/imdb", (*FILMS, "learner.kind=online_dpo", "learner.soft=true", "learner.beta=0.1")),
 }
 
 
