@@ -82,6 +82,14 @@ def test_any_algorithm_learns_and_goes_on_bit_for_bit_where_it_was_saved(
 
 
 @every
+def test_any_algorithm_starts_from_its_own_zip(name: Name, tmp_path: Any) -> None:
+    learner = _learner(_task(name), _settings(name))
+    learner.save(tmp_path / "policy.zip")
+    other = _learner(_task(name), _settings(name), seed=7, start=tmp_path / "policy.zip")
+    assert _bytes(other) == _bytes(learner)
+
+
+@every
 def test_the_table_says_of_algorithms_what_is_so(name: Name) -> None:
     known, parameters = ALGORITHMS[name], signature(algorithm_class(name)).parameters
     assert issubclass(algorithm_class(name), OffPolicyAlgorithm) is known.replays
