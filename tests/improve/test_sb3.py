@@ -361,6 +361,7 @@ def test_a_policy_that_lost_clearly_goes_back_and_what_is_replayed_stays(store: 
     assert _bytes(learner) != good
     assert learner.go_back() == 1
     assert _bytes(learner) == good
+    _assert_same(_optimizer(learner).state_dict()["state"], moments["state"])
 
 
 def _optimizer(learner: SB3) -> torch.optim.Optimizer:
