@@ -16,13 +16,16 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Protocol
+from typing import IO, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from prefrl.components import ConfigError, suggest
 from prefrl.sweeps.plan import Member
 
+T = TypeVar("T")
 STOPPING = 30.0
 """Seconds that runs are given to stop in good order."""
+STOPPED = 130
+"""The status of a run that Ctrl-C stopped."""
 HOURS = 72
 """The time limit of a cluster job, in hours."""
 
@@ -72,27 +75,45 @@ def each(
             stop()
 
 
+class _UnderWay(Generic[T]):
+    """What was begun and is not over, from several threads; once it is stopped, nothing begins any more."""
+
+    def __init__(self) -> None:
+        self.there: set[T] = set()
+        self.stopped, self._lock = False, threading.Lock()
+
+    def begin(self, start: Callable[[], T]) -> T | None:
+        """What `start` gives; None where all is stopped."""
+        with self._lock:
+            if self.stopped:
+                return None
+            self.there.add(begun := start())
+            return begun
+
+    def stop(self) -> list[T]:
+        """What was under way then."""
+        with self._lock:
+            self.stopped = True
+            return list(self.there)
+
+
 class Local:
     """Processes of this machine."""
 
     def __init__(self) -> None:
-        self._running: set[subprocess.Popen[bytes]] = set()
-        self._lock, self._stopped = threading.Lock(), False
+        self._processes: _UnderWay[subprocess.Popen[bytes]] = _UnderWay()
 
     def call(self, job: Job) -> int:
-        with job.log.open("ab") as log, self._lock:
-            if self._stopped:
-                return 130
-            process = _started(job.command(), log)
-            self._running.add(process)
+        with job.log.open("ab") as log:
+            process = self._processes.begin(lambda: _started(job.command(), log))
+        if process is None:
+            return STOPPED
         status = process.wait()
-        self._running.discard(process)
+        self._processes.there.discard(process)
         return status
 
     def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-            left = list(self._running)
+        left = self._processes.stop()
         for process in left:
             process.send_signal(signal.SIGINT)  # to all, before one is waited for
         deadline = time.monotonic() + STOPPING
@@ -108,31 +129,26 @@ class Submitit:
 
         self._executor = submitit.AutoExecutor(folder=state)
         self._executor.update_parameters(timeout_min=60 * HOURS, name="prefrl", cpus_per_task=1)
-        self._running: set[Any] = set()
-        self._lock, self._stopped = threading.Lock(), False
+        self._jobs: _UnderWay[Any] = _UnderWay()
 
     def call(self, job: Job) -> int:
-        with self._lock:
-            if self._stopped:
-                return 130
-            sent = self._executor.submit(_called, job.command(), str(job.log), str(Path.cwd()))
-            self._running.add(sent)
+        sent = self._jobs.begin(lambda: self._executor.submit(_called, *_told(job)))
+        if sent is None:
+            return STOPPED
         sent.wait()
-        self._running.discard(sent)
+        self._jobs.there.discard(sent)
         return int(sent.result()) if sent.exception() is None else 1
 
     def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-            left = list(self._running)
-        for sent in left:
+        for sent in self._jobs.stop():
             sent.cancel(check=False)
 
 
 class Ray:
     """Tasks of Ray, one CPU each: on the cluster that `RAY_ADDRESS` names, else on one that is started here.
 
-    Raises `ConfigError` where there is no cluster at that address.
+    Nothing of this process's environment is taken along: nodes have prefrl, and see the folder, as with Slurm. Raises
+    `ConfigError` where there is no cluster at that address.
     """
 
     def __init__(self) -> None:
@@ -143,42 +159,40 @@ class Ray:
         for name in ("RAY_USAGE_STATS_ENABLED", "RAY_worker_niceness"):
             os.environ.setdefault(name, "0")
         where = os.environ.get("RAY_ADDRESS") or "local"  # else it would join any cluster that was started here
-        # Nothing of the driver's environment is taken along: nodes have prefrl, and see the folder, as with Slurm.
         own: dict[str, Any] = {"include_dashboard": False} if where == "local" else {}
         try:
             ray.init(where, log_to_driver=False, configure_logging=False, **own)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ConfigError(f"--launcher ray: there is no cluster at RAY_ADDRESS={where}: {error}") from error
         self._called = ray.remote(num_cpus=1, max_retries=0)(_called)
-        self._running: set[Any] = set()
-        self._lock, self._stopped = threading.Lock(), False
+        self._tasks: _UnderWay[Any] = _UnderWay()
 
     def call(self, job: Job) -> int:
-        with self._lock:
-            if self._stopped:
-                return 130
-            sent = self._called.remote(job.command(), str(job.log.absolute()), str(Path.cwd()))
-            self._running.add(sent)
+        sent = self._tasks.begin(lambda: self._called.remote(*_told(job)))
+        if sent is None:
+            return STOPPED
         try:
             return int(self._ray.get(sent))
         except self._ray.exceptions.RayError as error:  # its node is gone, say: the folder tells how far it came
-            if not self._stopped:
+            if not self._tasks.stopped:
                 with job.log.open("a", encoding="utf-8") as log:
                     log.write(f"Ray: {error}\n")
             return 1
         finally:
-            self._running.discard(sent)
+            self._tasks.there.discard(sent)
 
     def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-            left = list(self._running)
-        for sent in left:
+        for sent in self._tasks.stop():
             self._ray.cancel(sent)  # raises KeyboardInterrupt there
         deadline = time.monotonic() + 2 * STOPPING
-        while self._running and time.monotonic() < deadline:
+        while self._tasks.there and time.monotonic() < deadline:
             time.sleep(0.05)  # whoever waits for a task would be ended by a shutdown
         self._ray.shutdown()
+
+
+def _told(job: Job) -> tuple[list[str], str, str]:
+    """What `_called` is given."""
+    return job.command(), str(job.log.absolute()), str(Path.cwd())
 
 
 def _called(command: list[str], log: str, place: str) -> int:
