@@ -117,7 +117,7 @@ def test_a_zip_of_stable_baselines3_explores_by_the_state_as_well(squash: bool, 
     policy.named()["actor_2"].data.mul_(300)  # so that actions come near their bounds
     save_ppo(policy, task, tmp_path / "policy.zip")
     theirs = PPO.load(tmp_path / "policy.zip")
-    assert theirs.use_sde
+    assert (theirs.use_sde, theirs.sde_sample_freq) == (True, policy.settings.sde_steps)
     _, actions = policy.numpy_actor()(seen, None)
     np.testing.assert_allclose(actions, theirs.predict(seen, deterministic=True)[0], atol=1e-5)
     assert np.abs(actions).max() > 1.5
