@@ -76,8 +76,8 @@ def verdict(facts: Facts) -> str:
     if facts.drifted is not None:
         since, near, far = facts.drifted
         remarks.append(
-            f"Since round {since} it went from {show_number(near)} to {show_number(far)} nats away from its start, and "
-            "its learned score did not rise: that round has the better policy, or hold it nearer to its start."
+            f"Since round {since} it went from {show_number(near)} to {show_number(far)} nats away from its start, but "
+            "its learned score did not rise: stop earlier, or keep it nearer to its start."
         )
     start, end = facts.fluency
     if start is not None and end is not None:
