@@ -1,7 +1,7 @@
 """Gold beside another measure over the KL to the start: every learner of text, and best-of-n, in one figure.
 
     python benchmarks/text_frontier.py [--task rubric|imdb] [--seeds 2] [--first 100] [--out runs/frontier] [--to FILE]
-        [--short]
+        [--learners RLOO PPO ...] [--short]
 
 `rubric`: the rubric of reviews, which fewer than one in a hundred of the start's responses meet, with 300 comparisons
 in four rounds. Learners that write have 30 batches of 128 responses in each. The other measure is fluency.
@@ -10,7 +10,8 @@ in four rounds. Learners that write have 30 batches of 128 responses in each. Th
 24 batches in eight rounds, and writes as many responses for each.
 
 A point is an evaluation after a round, the mean over seeds. Best-of-n is by the reward of the first RLOO run, as in
-text_best_of_n.py. Finished runs are taken up. Writes FILE.csv and FILE.svg (docs/curves/text_frontier, and
+text_best_of_n.py. Finished runs are taken up. With `--learners` only those run, and what FILE.csv has of others and of
+other seeds is kept. Writes FILE.csv and FILE.svg (docs/curves/text_frontier, and
 text_frontier_imdb); the last line is one JSON object: for each learner where it ended.
 """
 
@@ -21,6 +22,7 @@ import csv
 import json
 import subprocess
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ from prefrl.evaluate.summary import read_metrics
 from prefrl.rundir import open_saved
 from prefrl.stages import policy_of, reward_of
 
+BEST = "best-of-n"
 Runs = dict[str, tuple[str, tuple[str, ...]]]
 """A preset and its settings, by the name of the learner."""
 
@@ -51,11 +54,17 @@ ON_RUBRIC: Runs = {
     "SFT": ("text/reviews-dpo", (*RUBRIC, "learner.kind=sft", "learner.epochs=4", "learner.evaluation_prompts=256")),
 }
 FILMS = ("loop.rounds=8", "learner.evaluation_prompts=96")
+LIKE_RLOO = ("learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", "learner.policy.train=lora")
 ON_FILMS: Runs = {
     "RLOO": ("text/imdb", FILMS),
     "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),
     "REINFORCE": ("text/imdb", (*FILMS, "learner.algorithm=reinforce")),
     "PPO": ("text/imdb", (*FILMS, "learner.algorithm=ppo", "learner.epochs=2")),
+    "online DPO": (
+        "text/imdb",
+        (*FILMS, "learner.kind=online_dpo", *LIKE_RLOO, "learner.prompts=24", "learner.soft=true"),
+    ),
+    "RAFT": ("text/imdb", (*FILMS, "learner.kind=raft", *LIKE_RLOO, "learner.prompts=6", "learner.minibatch=6")),
 }
 
 
@@ -83,11 +92,14 @@ WORLDS = {
     ),
 }
 
+NAMES = list(dict.fromkeys([*ON_RUBRIC, *ON_FILMS, BEST]))
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=tuple(WORLDS), default="rubric")
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--learners", nargs="+", choices=NAMES, help="only these; what the file has of others is kept")
     parser.add_argument("--first", type=int, default=100, help="the first seed")
     parser.add_argument("--out", type=Path, help="runs/frontier, or runs/frontier-imdb")
     parser.add_argument("--to", type=Path, help="docs/curves/text_frontier, or text_frontier_imdb")
@@ -97,12 +109,14 @@ def main() -> None:
     out = options.out or Path(f"runs/frontier{tail.replace('_', '-')}")
     to = options.to or Path(f"docs/curves/text_frontier{tail}")
     seeds = [options.first] if options.short else range(options.first, options.first + options.seeds)
-    rows: list[dict[str, Any]] = []
+    asked = options.learners or [*world.runs, BEST]
+    rows = [] if options.learners is None else kept(to.with_suffix(".csv"), asked, seeds)
     for seed in seeds:
-        for name in world.runs:
+        for name in (name for name in asked if name != BEST):
             rows += rounds_of(world, name, seed, out, options.short)
             print(json.dumps(rows[-1]), flush=True)
-    rows += best_of_n(world, folder_of("RLOO", options.first, out), options.first, options.short)
+    if BEST in asked:
+        rows += best_of_n(world, folder_of("RLOO", options.first, out), options.first, options.short)
     to.parent.mkdir(parents=True, exist_ok=True)
     with to.with_suffix(".csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
@@ -112,6 +126,14 @@ def main() -> None:
     ends = {name: ends_of(world, rows, name) for name in world.runs}
     found = {"name": f"text_frontier: {options.task}", "unit": "gold, KL"}
     print(json.dumps(found | {"ends": ends, "short": options.short}))
+
+
+def kept(file: Path, learners: Collection[str], seeds: Collection[int]) -> list[dict[str, Any]]:
+    """The rows of a file that are not to be made anew."""
+    with file.open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    found = [{x: value if x == "learner" else json.loads(value) for x, value in one.items()} for one in rows]
+    return [one for one in found if one["learner"] not in learners or one["seed"] not in seeds]
 
 
 def rounds_of(world: World, name: str, seed: int, out: Path, short: bool) -> list[dict[str, Any]]:
@@ -148,7 +170,7 @@ def best_of_n(world: World, folder: Path, seed: int, short: bool) -> list[dict[s
     curves = curves_of(judged, measures(base, task) | {"learned": judged}, size.pool)
     counts = [2**i for i in range(size.pool.bit_length())]
     values = [{"kl": kl_bound(n)} | {x: curves[x][n - 1] for x in world.measures} for n in counts]
-    return [row("best-of-n", seed, n, found) for n, found in zip(counts, values, strict=True)]
+    return [row(BEST, seed, n, found) for n, found in zip(counts, values, strict=True)]
 
 
 def ends_of(world: World, rows: list[dict[str, Any]], name: str) -> dict[str, float]:
@@ -165,9 +187,9 @@ def draw(world: World, rows: list[dict[str, Any]]) -> Figure:
         ax.set(xlabel="KL to the start, nats a response", ylabel=label, ylim=(0, 1))
         ax.grid(color="0.9")
         ax.spines[["top", "right"]].set_visible(False)
-        for name in ("best-of-n", *world.runs):
+        for name in (BEST, *world.runs):
             kl, value = over_rounds(rows, name, measure)
-            style = {"color": "0.3", "linestyle": "--", "linewidth": 2} if name == "best-of-n" else {"marker": "o"}
+            style = {"color": "0.3", "linestyle": "--", "linewidth": 2} if name == BEST else {"marker": "o"}
             ax.plot(kl, value, label=name, markersize=4, **style)
     axes[1].legend(frameon=False, ncols=2, loc="lower left" if "fluency" in world.measures else "lower right")
     return figure
