@@ -1,4 +1,4 @@
-"""The judgements: what can be answered to a query. NumPy and the standard library only."""
+"""The answers: judgements, demonstrations, and none. NumPy and the standard library only."""
 
 from __future__ import annotations
 
@@ -107,10 +107,47 @@ class Skip:
     shown: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True)
+class Demonstration:
+    """An answer that is a behaviour: "like this". It answers a query of one candidate, the learner's own.
+
+    In control the behaviour has an expert's actions in the states of the query, or is an episode that stands for
+    itself; in text it is a better response.
+    """
+
+    query: str
+    like: str
+    """The id of the candidate that shows what to do; the query's own where that stands for itself."""
+    labeler: str = ""
+    shown: tuple[int, ...] = ()
+    weight: float = 1.0
+    reason: ClassVar[Literal["demonstration"]] = "demonstration"
+    """Why there is no judgement: it says what to do."""
+
+    def __post_init__(self) -> None:
+        check_weight(self.weight)
+
+
 Judgement: TypeAlias = Comparison | Ranking | Choice | Rating
 
 
-Answer: TypeAlias = Judgement | Skip
+Answer: TypeAlias = Judgement | Demonstration | Skip
+
+
+@dataclass(frozen=True)
+class Demonstrated(Generic[C]):
+    """A query with the behaviour that answers it. Raises `ValueError` where the two do not fit."""
+
+    query: Query[C]
+    like: C
+    demonstration: Demonstration
+
+    def __post_init__(self) -> None:
+        check_fits(self.demonstration, len(self.query.candidates))
+        if (self.demonstration.query, self.demonstration.like) != (self.query.id, self.like.id):
+            raise ValueError(f"query {self.query.id[:12]} got a demonstration of query {self.demonstration.query[:12]}")
+        if self.like.context != self.query.candidates[0].context:
+            raise ValueError(f"query {self.query.id[:12]} is answered by a behaviour of another context (prompt)")
 
 
 @dataclass(frozen=True)
@@ -137,6 +174,8 @@ def check_fits(answer: Answer, size: int) -> None:
             fits = size >= 2 and best < size
         case Rating(levels=levels):
             fits = size == len(levels)
+        case Demonstration():
+            fits = size == 1
         case Skip():
             fits = True
     if not fits:
@@ -175,7 +214,7 @@ def best_of(answer: Answer) -> int | None:
             worth = list(levels)
         case Choice(best=best):
             return best
-        case Skip():
+        case Demonstration() | Skip():
             return None
     return worth.index(max(worth)) if worth.count(max(worth)) == 1 else None
 
@@ -209,7 +248,7 @@ def moved(answer: Answer, places: Sequence[int]) -> Answer:
             return replace(answer, levels=_in_places(levels, places))
         case Choice(best=best):
             return replace(answer, best=places[best])
-        case Skip():
+        case Demonstration() | Skip():
             return answer
 
 
@@ -238,6 +277,8 @@ def columns(answer: Answer) -> Json:
             return {"best": best}
         case Rating(levels=levels, scale=scale):
             return {"ratings": list(levels), "scale": scale}
+        case Demonstration(like=like):
+            return {"like": like}
         case Skip(reason=reason):
             return {"skip": reason}
 

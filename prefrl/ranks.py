@@ -19,7 +19,7 @@ from prefrl.components import Settings
 from prefrl.distributed import each_tensor, heard_by_torch, joined, together, world
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit
-from prefrl.judgements import Answer, Judged
+from prefrl.judgements import Answer, Demonstrated, Judged
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Divides, Labeler, Learner, RewardModel, Selector, Store, text
 from prefrl.seeding import to_host, to_numpy
@@ -43,6 +43,9 @@ class SharedStore(Generic[C]):
     def judged(self, upto: int | None = None) -> list[Judged[C]]:
         return world().first(lambda: list(self.own.judged(upto)))
 
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[C]]:
+        return world().first(lambda: list(self.own.demonstrations(upto)))
+
     def open_queries(self, labeler: str = "") -> list[Query[C]]:
         return world().first(lambda: list(self.own.open_queries(labeler)))
 
@@ -51,6 +54,9 @@ class SharedStore(Generic[C]):
 
     def ask(self, queries: Sequence[Query[C]]) -> None:
         world().first(lambda: self.own.ask(queries))
+
+    def keep(self, candidates: Sequence[C]) -> None:
+        world().first(lambda: self.own.keep(candidates))
 
     def answer(self, answers: Sequence[Answer]) -> None:
         world().first(lambda: self.own.answer(answers))

@@ -15,7 +15,7 @@ from typing import Generic
 
 import sqlalchemy as sql
 
-from prefrl.judgements import Answer, Judged, check_fits
+from prefrl.judgements import Answer, Demonstrated, Demonstration, Judged, check_fits
 from prefrl.storage.arrivals import Merged, check_arrivals
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.events import answer_body, answer_kind, describe, load_candidate, read_answer, write_candidate
@@ -71,11 +71,18 @@ class Store(Generic[C]):
         if purpose != "label":
             more = [{"purpose": purpose, "expected": best} for _, best in zip(queries, expected, strict=True)]
         with self.log.transaction() as tx:
-            rows = [row(id, "candidate", body=describe(candidate)) for id, candidate in candidates.items()]
+            rows = _rows(candidates.values())
             for query, extra in zip(queries, more, strict=True):
                 body = {"candidates": [c.id for c in query.candidates], "batch": tx.seq} | extra
                 rows.append(row(query.id, "query", body=body))
             tx.extend(rows)
+
+    def keep(self, candidates: Sequence[C]) -> None:
+        """Add candidates that no query asks about: behaviours for demonstrations to show. Gold is filed apart."""
+        self._check_kind(candidates)
+        self._file(candidates)
+        with self.log.transaction() as tx:
+            tx.extend(_rows(candidates))
 
     def answer(self, answers: Sequence[Answer]) -> None:
         """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
@@ -91,6 +98,8 @@ class Store(Generic[C]):
             if answer.query not in sizes:
                 raise StoreError(f"an answer to query {answer.query[:12]}, which was never asked")
             _check_size(answer, sizes[answer.query])
+            if isinstance(answer, Demonstration):
+                self._check_shown(tx, answer)
             body = answer_body(answer) | ({"about": about} if about else {})
             revision = there.get((answer.query, answer.labeler), {"revision": 0})["revision"]
             id = f"{answer.query}:{answer.labeler}:{revision}"
@@ -127,6 +136,16 @@ class Store(Generic[C]):
                 list(pool.map(partial(self._copy, blobs), (e for e in some if e["kind"] == "candidate")))
                 tx.extend(some)
         return merged
+
+    def _check_shown(self, tx: Transaction, answer: Demonstration) -> None:
+        """Raise `StoreError` unless what is shown is here, and of its query's context."""
+        (own,) = bodies(tx.connection, [answer.query])[answer.query]["candidates"]
+        found = bodies(tx.connection, [own, answer.like])
+        if answer.like not in found:
+            raise StoreError(f"a demonstration of candidate {answer.like[:12]}, which the store does not hold")
+        contexts = {load_candidate(id, body, self.folder / "blobs").context for id, body in found.items()}
+        if len(contexts) > 1:
+            raise StoreError(f"query {answer.query[:12]} is answered by a behaviour of another context (prompt)")
 
     def _copy(self, blobs: Path, one: Json) -> None:
         self._file_one(load_candidate(one["id"], one["body"], blobs))
@@ -174,6 +193,14 @@ class Store(Generic[C]):
         answers = list(self._standing(JUDGEMENTS, upto))
         self._fetch({answer.query for answer in answers})
         return [Judged(self.query(a.query), a) for a in answers if a.reason is None]
+
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[C]]:
+        """Queries with the behaviours that answer them, in the order in which they were given, up to a sequence
+        number."""
+        answers = [a for a in self._standing(["demonstration"], upto) if isinstance(a, Demonstration)]
+        self._fetch({answer.query for answer in answers})
+        self._load({answer.like for answer in answers})
+        return [Demonstrated(self.query(a.query), self.candidate(a.like), a) for a in answers]
 
     def answers(self) -> list[Answer]:
         """Every answer that stands, skips included, in the order in which they were given."""
@@ -257,6 +284,11 @@ class Store(Generic[C]):
                 known = sql.select(event.c.id).where(event.c.id.in_(some), event.c.seq <= sequence)
                 found |= set(connection.scalars(known))
         return found
+
+
+def _rows(candidates: Iterable[Candidate]) -> list[Json]:
+    """The events that add candidates."""
+    return [row(candidate.id, "candidate", body=describe(candidate)) for candidate in candidates]
 
 
 def _sizes(tx: Transaction, ids: Iterable[str]) -> dict[str, int]:

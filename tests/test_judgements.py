@@ -5,7 +5,22 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from prefrl.judgements import Answer, Choice, Comparison, Judged, Ranking, Rating, Skip, check_fits, implied_pairs
+from prefrl.judgements import (
+    Answer,
+    Choice,
+    Comparison,
+    Demonstrated,
+    Demonstration,
+    Judged,
+    Ranking,
+    Rating,
+    Skip,
+    best_of,
+    check_fits,
+    columns,
+    implied_pairs,
+    moved,
+)
 from prefrl.types import Query, Response
 
 
@@ -73,3 +88,26 @@ def test_the_best_of_a_few_beats_each_other_and_a_rating_compares_levels() -> No
     assert implied_pairs(Choice("q", 1), 3) == [(1, 0, 1.0), (1, 2, 1.0)]
     assert implied_pairs(Rating("q", (2, 0, 2), 3), 3) == [(0, 1, 1.0), (0, 2, 0.5), (1, 2, 0.0)]
     assert implied_pairs(Rating("q", (2,), 3), 1) == []
+
+
+def test_a_demonstration_answers_a_query_of_one_candidate_with_one_of_its_context() -> None:
+    own, better, other = Response("p", "so so"), Response("p", "good"), Response("q", "good")
+    query = Query((own,))
+    shown = Demonstration(query.id, better.id)
+    assert Demonstrated(query, better, shown).like.text == "good"
+    with pytest.raises(ValueError, match="another context"):
+        Demonstrated(query, other, Demonstration(query.id, other.id))
+    with pytest.raises(ValueError, match="got a demonstration of query"):
+        Demonstrated(query, own, shown)
+    with pytest.raises(ValueError, match="has 2 candidates"):
+        check_fits(shown, 2)
+    with pytest.raises(ValueError, match="weight"):
+        Demonstration(query.id, better.id, weight=0.0)
+
+
+def test_a_demonstration_judges_nothing() -> None:
+    shown = Demonstration("q", "c", "ann")
+    assert shown.reason == "demonstration"
+    assert best_of(shown) is None
+    assert moved(shown, (0,)) == shown
+    assert columns(shown) == {"like": "c"}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from stores import derived, fill, responses
 
-from prefrl.judgements import Comparison, Ranking, Skip
+from prefrl.judgements import Comparison, Demonstration, Ranking, Skip
 from prefrl.storage.files import DamagedError
 from prefrl.storage.log import StoreError
 from prefrl.storage.maintenance import backup, verify_store
@@ -254,3 +254,37 @@ def test_numbers_that_numpy_made_are_kept(folder: Path) -> None:
     with Store[Response](folder, write=False) as store:
         assert [a.ranks for a in store.answers() if isinstance(a, Ranking)] == [(1, 2, 0)]
         assert [a.preference for a in store.answers() if isinstance(a, Comparison)] == [0.25, 0.75]
+
+
+def test_demonstrations_come_back_with_what_they_show_and_close_their_queries(text_store: Store[Response]) -> None:
+    asked = [Query((Response(f"p{i}", "so so", (1,), (2, 3)),)) for i in range(3)]
+    text_store.ask(asked)
+    better = Response("p0", "good", (1,), (4,), gold=np.array([1.0]))
+    text_store.keep([better])
+    itself = asked[1].candidates[0]
+    text_store.answer([Demonstration(asked[0].id, better.id, "ann", weight=2.0)])
+    text_store.answer([Demonstration(asked[1].id, itself.id, "ann")])
+    first, second = text_store.demonstrations()
+    assert (first.like.text, first.like.tokens, first.like.gold, first.demonstration.weight) == ("good", (4,), None, 2)
+    assert second.like.id == itself.id
+    assert text_store.judged() == []
+    assert [q.id for q in text_store.open_queries()] == [asked[2].id]
+    assert text_store.counts() == {"asked": 3, "answered": 2, "skipped": 0}
+    text_store.retract(asked[0].id, "ann")
+    assert [one.like.id for one in text_store.demonstrations()] == [itself.id]
+    before = derived(text_store.folder)
+    with text_store.log.transaction() as tx:
+        rebuild(tx.connection)
+    with text_store.log.reading() as connection:
+        assert list(dump(connection)) == before
+
+
+def test_a_demonstration_of_what_is_not_here_or_of_another_prompt_is_refused(text_store: Store[Response]) -> None:
+    query, other = Query((Response("p", "so so"),)), Response("q", "good")
+    text_store.ask([query])
+    with pytest.raises(StoreError, match="which the store does not hold"):
+        text_store.answer([Demonstration(query.id, other.id, "ann")])
+    text_store.keep([other])
+    with pytest.raises(StoreError, match="another context"):
+        text_store.answer([Demonstration(query.id, other.id, "ann")])
+    assert text_store.demonstrations() == []

@@ -31,6 +31,7 @@ class Form(StrEnum):
     conversational = "conversational"
     unpaired = "unpaired"
     unpaired_conversational = "unpaired-conversational"
+    demonstrations = "demonstrations"
     judgements = "judgements"
     dataset = "dataset"
     argilla = "argilla"
@@ -59,6 +60,7 @@ class Rows(StrEnum):
     auto = "auto"
     preferences = "preferences"
     unpaired = "unpaired"
+    demonstrations = "demonstrations"
     responses = "responses"
     tree = "tree"
     argilla = "argilla"
@@ -149,7 +151,7 @@ def import_(
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave bad rows out, and name them.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, write nothing.")] = False,
 ) -> None:
-    """Read judgements from files into a store, all or none."""
+    """Read judgements and demonstrations from files into a store, all or none."""
     from prefrl.cli.console import say
     from prefrl.exchange.layout import Layout, Which
 
@@ -159,7 +161,7 @@ def import_(
         for line in note.splitlines()[:SHOWN]:
             say(line, "yellow")
     new = f": {done.read - done.known} new, {done.known} there already" if done.known else ""
-    say(f"{done.read} judgements {'would be read' if dry_run else 'read'} into {out}{new}")
+    say(f"{done.read} answers {'would be read' if dry_run else 'read'} into {out}{new}")
 
 
 def _import(path: Path, out: Path, which: Which, layout: Layout) -> Imported:

@@ -12,7 +12,12 @@ from prefrl.exchange.bundles import export_bundle, import_bundle, is_bundle, try
 from prefrl.exchange.exports.dataset import export_dataset
 from prefrl.exchange.exports.given import Exported
 from prefrl.exchange.exports.minari import export_minari
-from prefrl.exchange.exports.rows import export_judgements, export_preferences, export_unpaired
+from prefrl.exchange.exports.rows import (
+    export_demonstrations,
+    export_judgements,
+    export_preferences,
+    export_unpaired,
+)
 from prefrl.exchange.exports.table import export_csv
 from prefrl.exchange.exports.tools import export_arena, export_argilla, export_label_studio
 from prefrl.exchange.formats import check_file
@@ -46,6 +51,7 @@ EXPORTS: Mapping[str, Callable[[Store, Path, str], Exported]] = {
     "conversational": lambda store, path, ties: export_preferences(store, path, ties, conversational=True),
     "unpaired": lambda store, path, _: export_unpaired(store, path),
     "unpaired-conversational": lambda store, path, _: export_unpaired(store, path, conversational=True),
+    "demonstrations": lambda store, path, _: export_demonstrations(store, path),
     "judgements": lambda store, path, _: export_judgements(store, path),
     "dataset": lambda store, path, _: export_dataset(store, path),
     "argilla": lambda store, path, _: export_argilla(store, path),

@@ -3,6 +3,7 @@
 - `{"prompt", "chosen", "rejected"}` as text, or as lists of `{"role", "content"}`; without a prompt where chosen and
   rejected are whole conversations. `"margin"` or `"preference"` says how much better;
 - `{"prompt", "completion", "label"}`: one response, good or not;
+- `{"prompt", "completion"}`: a demonstration;
 - `{"prompt", "responses": [...]}` with one of `"ranks"`, `"best"`, `"ratings"` (and `"scale"`), `"preference"` or
   `"skip"`;
 - conversation trees of OpenAssistant (Koepf et al. 2023): a ranking of the replies to each of a person's turns;
@@ -42,8 +43,8 @@ from prefrl.exchange.transcripts import (
     response_text,
     split_conversations,
 )
-from prefrl.judgements import Rating
-from prefrl.types import Fields, Json
+from prefrl.judgements import Demonstration, Rating
+from prefrl.types import Fields, Json, Response
 
 COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "label", "responses", *VERDICTS, "scale")
 _NO_TEXT = ("margin", "label", "responses", *VERDICTS, "scale", "weight", "shown")
@@ -88,7 +89,9 @@ def form_of(row: Fields) -> str:
         return "tree"
     if row.get("responses") is not None:
         return "responses"
-    return "unpaired" if "completion" in row and "chosen" not in row else "preferences"
+    if "completion" in row and "chosen" not in row:
+        return "unpaired" if "label" in row else "demonstrations"
+    return "preferences"
 
 
 def _mapped(row: Json, columns: Mapping[str, str]) -> Json:
@@ -173,14 +176,29 @@ def _strength(row: Fields) -> float:
 
 def _unpaired(row: Fields) -> list[Row | str]:
     """One response that is good or not: a rating on a scale of two levels."""
-    label, completion = row.get("label"), row.get("completion")
+    label = row.get("label")
     if label not in (0, 1) or not isinstance(label, bool | int):
         raise ValueError(f"column 'label': expected true or false, got {label!r:.200}")
+    return [answered(row, [_completion(row)], partial(_good, int(label)))]
+
+
+def _completion(row: Fields) -> Response:
+    completion = row.get("completion")
     if isinstance(completion, list):
         completion = response_text(read_messages(completion))
     if not isinstance(completion, str) or not isinstance(row.get("prompt"), str | list):
         raise ValueError(f'expected "prompt" and "completion" as text or messages, got {row!r:.200}')
-    return [answered(row, responses(_prompt(row["prompt"]), [completion]), partial(_good, int(label)))]
+    return Response(_prompt(row["prompt"]), completion)
+
+
+def _demonstration(row: Fields) -> list[Row | str]:
+    """One response that shows what is wanted."""
+    shown = _completion(row)
+    return [answered(row, [shown], partial(_like, shown.id))]
+
+
+def _like(candidate: str, query: str, order: Sequence[int], who: Json) -> Demonstration:
+    return Demonstration(query, candidate, **who)
 
 
 def _good(level: int, query: str, order: Sequence[int], who: Json) -> Rating:
@@ -253,6 +271,7 @@ def _of_tool(name: str, row: Fields) -> list[Row | str]:
 FORMS: Mapping[str, Callable[[Fields], list[Row | str]]] = {
     "preferences": _pair,
     "unpaired": _unpaired,
+    "demonstrations": _demonstration,
     "responses": _responses,
     "tree": _trees,
     "argilla": partial(_of_tool, "argilla"),

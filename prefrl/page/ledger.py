@@ -178,7 +178,7 @@ def signature(answer: Answer, pairs: list[tuple[int, int, float]]) -> Signature:
 
 
 def word(answer: Answer) -> int:
-    if answer.reason is None:
+    if answer.reason in (None, "demonstration"):
         return JUDGED
     return INCOMPARABLE if answer.reason == "incomparable" else SKIPPED
 

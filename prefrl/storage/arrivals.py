@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.judgements import Answer, same
+from prefrl.judgements import Answer, Demonstration, same
 from prefrl.storage.engines import StoreError
 from prefrl.storage.events import (
     check_answer,
@@ -62,6 +62,8 @@ class _Arrivals:
     candidates: dict[str, _Candidate] = field(default_factory=dict)
     sizes: dict[str, int] = field(default_factory=dict)
     """Query -> how many candidates it has."""
+    contexts: dict[str, bytes] = field(default_factory=dict)
+    """The same of those that have one, which a demonstration may answer -> the context of that one."""
     words: dict[bytes, int] = field(default_factory=dict)
     """(query, labeler) -> answers and retractions so far, which take turns."""
 
@@ -94,12 +96,19 @@ class _Arrivals:
         context = hashlib.sha256(loaded.context.encode("utf-8", "surrogatepass")).digest()
         self.candidates[one["id"]] = _Candidate(one["id"], context)
 
+    def _context(self, id: str) -> bytes:
+        if id not in self.candidates:
+            raise StoreError(f"it shows candidate {id[:12]}, which is not there")
+        return self.candidates[id].context
+
     def _query(self, id: str, body: Event) -> int:
         """How many candidates it has; they must be there, and make up its id."""
         query = Query[Any](tuple(self.candidates[c] for c in body["candidates"]))
         if query.id != id or [c.id for c in query.candidates] != body["candidates"]:
             raise StoreError(f"query {id[:12]} does not have the sha256 of its candidates")
         check_purpose(body, len(query.candidates))
+        if len(query.candidates) == 1:
+            self.contexts[id] = query.candidates[0].context
         return len(query.candidates)
 
     def _word(self, one: Event) -> None:
@@ -111,7 +120,10 @@ class _Arrivals:
         if one["id"] != expected or (one["kind"] == "retract") != bool(count % 2):
             raise StoreError(f"its id {one['id'][:20]} is not that of this labeler's next word on its query")
         if one["kind"] in ANSWERS:
-            check_answer(_answer(one, one["kind"], one["body"]), self.sizes[one["subject"]])
+            answer = _answer(one, one["kind"], one["body"])
+            check_answer(answer, self.sizes[one["subject"]])
+            if isinstance(answer, Demonstration) and self._context(answer.like) != self.contexts[answer.query]:
+                raise StoreError(f"it answers query {answer.query[:12]} with a behaviour of another context")
         self.words[key] = count + 1
 
 

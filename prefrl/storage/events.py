@@ -10,14 +10,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from prefrl.judgements import Answer, Choice, Comparison, Ranking, Rating, Skip, check_fits
+from prefrl.judgements import Answer, Choice, Comparison, Demonstration, Ranking, Rating, Skip, check_fits
 from prefrl.kinds import kind_of, logged
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.engines import StoreError
 from prefrl.storage.projection import ANSWERS
 from prefrl.types import LARGEST, Candidate, Fields, Json, is_whole
 
-ANSWER_TYPES: dict[str, type[Answer]] = dict(zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Skip), strict=True))
+ANSWER_TYPES: dict[str, type[Answer]] = dict(
+    zip(ANSWERS, (Comparison, Ranking, Choice, Rating, Demonstration, Skip), strict=True)
+)
 PORTABLE = ("candidate", "query", *ANSWERS, "retract", "assign", "repeat", "guideline", "flag")
 """Kinds that a copy for others holds: what was asked and answered, not who may come in or how the project is set."""
 LEVELS = 10_000
@@ -84,7 +86,7 @@ def check_answer(answer: Answer, size: int) -> None:
     check_text("labeler", answer.labeler)
     if answer.shown and not _is_order(answer.shown, size):
         raise ValueError(f"shown: expected each of 0 to {size - 1} once, got {answer.shown!r:.200}")
-    if answer.reason is None and not _is_finite(answer.weight):
+    if not isinstance(answer, Skip) and not _is_finite(answer.weight):
         raise ValueError(f"weight: expected a finite number, got {answer.weight!r:.40}")
     match answer:
         case Comparison(preference=preference):
@@ -95,6 +97,8 @@ def check_answer(answer: Answer, size: int) -> None:
             good, expected = True, ""  # it is no larger than the query, see `check_fits`
         case Rating(scale=scale):
             good, expected = scale <= LEVELS, f"a scale of at most {LEVELS} levels"
+        case Demonstration(like=like):
+            good, expected = isinstance(like, str), "the id of a candidate"
         case Skip(reason=reason):
             good, expected = reason in ("skip", "incomparable"), "the reason skip or incomparable"
     if not good:

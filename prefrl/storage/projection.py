@@ -28,7 +28,9 @@ from prefrl.storage.tables import (
 from prefrl.types import Fields, Json
 
 JUDGEMENTS = ("comparison", "ranking", "choice", "rating")
-ANSWERS = (*JUDGEMENTS, "skip")
+OPINIONS = (*JUDGEMENTS, "skip")
+"""Answers that say something of the candidates asked about, or that nothing can be said."""
+ANSWERS = (*JUDGEMENTS, "demonstration", "skip")
 RETRACTED = "retracted"
 CHUNK = 400
 """Keys in one statement: databases limit the number of parameters."""
@@ -175,7 +177,7 @@ def _sort(one: Event) -> str:
 
 def _column(kind: str) -> str | None:
     """The count that an answer of a kind stands in."""
-    if kind in JUDGEMENTS:
+    if kind in JUDGEMENTS or kind == "demonstration":
         return "judged"
     return {"skip": "skipped", "incomparable": "incomparable"}.get(kind)
 

@@ -69,7 +69,7 @@ query = sql.Table(
     sql.Column("skipped", sql.Integer, nullable=False),
     sql.Index("query_open", "purpose", "judged"),
 )
-"""What was asked, in which batch, and how many answers of each sort stand."""
+"""What was asked, in which batch, and how many answers of each sort stand; `judged` counts demonstrations as well."""
 standing = sql.Table(
     "standing",
     metadata,

@@ -81,17 +81,17 @@ def test_columns_can_be_named_and_bad_rows_left_out(prefrl: Command) -> None:
     code, printed = prefrl(line)
     assert (code, "row 2: chosen and rejected are the same text" in printed) == (2, True)
     code, printed = prefrl(f"{line} --skip-bad")
-    assert (code, "1 judgements read into labels" in printed) == (0, True)
+    assert (code, "1 answers read into labels" in printed) == (0, True)
 
 
 def test_an_import_says_what_was_there_already(prefrl: Command) -> None:
-    assert "1 judgements read into labels\n" in prefrl("import in.jsonl --out labels")[1]
+    assert "1 answers read into labels\n" in prefrl("import in.jsonl --out labels")[1]
     Path("in.jsonl").write_text("".join(json.dumps(ROW | {"prompt": p}) + "\n" for p in ("p", "q")))
     assert (
-        "2 judgements would be read into labels: 1 new, 1 there already"
+        "2 answers would be read into labels: 1 new, 1 there already"
         in (prefrl("import in.jsonl --out labels --dry-run")[1])
     )
-    assert "2 judgements read into labels: 1 new, 1 there already" in prefrl("import in.jsonl --out labels")[1]
+    assert "2 answers read into labels: 1 new, 1 there already" in prefrl("import in.jsonl --out labels")[1]
 
 
 def test_an_export_never_writes_over_a_file_unasked(prefrl: Command) -> None:

@@ -12,7 +12,7 @@ from stores import fill, seal
 from prefrl.exchange.bundles import export_bundle, import_bundle, try_bundle
 from prefrl.exchange.layout import Layout
 from prefrl.exchange.ports import import_judgements, try_import
-from prefrl.judgements import Comparison, Ranking, Skip
+from prefrl.judgements import Comparison, Demonstration, Ranking, Skip
 from prefrl.storage import log
 from prefrl.storage.files import DamagedError
 from prefrl.storage.log import StoreError
@@ -204,3 +204,24 @@ def test_a_bundle_is_read_without_having_all_of_it_in_memory(
         tracemalloc.stop()
         assert copy.counts()["asked"] == 50
     assert peak < size * 2 / 3, f"{peak / 2**20:.1f} MB for {size / 2**20:.1f} MB"
+
+
+def test_demonstrations_survive_in_a_bundle_and_those_of_nothing_are_refused(
+    store: Store[Segment], make_query: Callable[..., Query[Segment]], tmp_path: Path
+) -> None:
+    query, like = make_query(0.0), make_query(5.0).candidates[0]
+    store.ask([query])
+    store.keep([like])
+    store.answer([Demonstration(query.id, like.id, "expert")])
+    export_bundle(store, tmp_path / "bundle")
+    with Store[Segment](tmp_path / "copy") as copy:
+        assert import_bundle(tmp_path / "bundle", copy) == (1, 0)
+        (shown,) = copy.demonstrations()
+        np.testing.assert_array_equal(shown.like.observations, like.observations)
+        assert list(copy.events()) == list(store.events())
+    events = (tmp_path / "bundle/events.jsonl").read_text().splitlines(keepends=True)
+    gone = [line for line in events if json.loads(line)["id"] != like.id]
+    (tmp_path / "bundle/events.jsonl").write_text("".join(gone))
+    seal(tmp_path / "bundle")
+    with Store[Segment](tmp_path / "other") as other, pytest.raises(ValueError, match="which is not there"):
+        import_bundle(tmp_path / "bundle", other)

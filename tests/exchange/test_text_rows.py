@@ -7,7 +7,7 @@ import pytest
 
 from prefrl.exchange.formats import read_judgements
 from prefrl.exchange.layout import Layout, Row
-from prefrl.exchange.ports import import_judgements, try_import
+from prefrl.exchange.ports import export, import_judgements, try_import
 from prefrl.exchange.text_rows import parse
 from prefrl.judgements import Comparison, Rating, Skip
 from prefrl.storage.log import StoreError
@@ -184,3 +184,27 @@ def test_a_row_that_is_not_of_the_form_that_was_named_is_a_mistake_in_a_row(form
     names = ("prompt", "responses", "fields", "data", "annotations", "conversation_a", "winner")
     with pytest.raises(ValueError):
         parse(dict.fromkeys(names, value), Layout(form))
+
+
+def test_a_completion_without_a_label_is_a_demonstration_and_is_written_so(
+    tmp_path: Path, text_store: Store[Response]
+) -> None:
+    rows: list[Mapping[str, Any]] = [
+        {"prompt": "p", "completion": "c"},
+        {"prompt": [Q], "completion": [YES], "labeler": "ann"},
+    ]
+    assert import_judgements(lines(tmp_path / "in.jsonl", *rows), text_store).read == 2
+    shown = [(one.like.prompt, one.like.text) for one in text_store.demonstrations()]
+    assert shown == [("p", "c"), ("Human: q\n\nAssistant: ", "yes")]
+    assert text_store.judged() == []
+    done = export(text_store, tmp_path / "out.jsonl", "demonstrations")
+    written = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [(row["prompt"], row["completion"]) for row in written] == shown
+    assert (done.written, done.dropped["annotator's name"]) == (2, 2)
+    dropped = export(text_store, tmp_path / "pairs.jsonl", "preferences").dropped
+    assert dropped["demonstration"] == 2
+
+
+def test_a_label_that_says_nothing_makes_no_demonstration_of_a_row() -> None:
+    with pytest.raises(ValueError, match="column 'label': expected true or false"):
+        one({"prompt": "p", "completion": "c", "label": None})

@@ -20,7 +20,7 @@ from prefrl.kinds import kind_of, only
 from prefrl.storage.events import load_candidate, read_answer
 from prefrl.storage.files import make_folder, sync_folder
 from prefrl.storage.log import StoreError
-from prefrl.storage.projection import ANSWERS, CHUNK, all_events, bodies, chunks, words
+from prefrl.storage.projection import CHUNK, OPINIONS, all_events, bodies, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
 from prefrl.store import Store
@@ -38,13 +38,14 @@ SKIP = "skipped query"
 WHOLE = "ranking, choice or rating as a whole (its pairs are written)"
 TOKENS = "response's tokens"
 OF_EVENTS = {
+    "demonstration": "demonstration",
     "retract": "answer that was taken back",
     "assign": "assignment",
     "repeat": "repeated answer",
     "flag": "report of a problem",
     "guideline": "guideline",
 }
-"""Events that are no answers, as they are called in a tally."""
+"""Events that are no judgements and no skips, as they are called in a tally."""
 CHECK = "check question"
 
 
@@ -69,7 +70,7 @@ class Exported:
 
 
 def each_answer(store: Store) -> Iterator[Given]:
-    """Every answer that stands, oldest first, skips included, those to check questions not; few in memory at a time."""
+    """Every judgement and skip that stands, oldest first, those to check questions not; few in memory at a time."""
     with store.log.reading() as connection:
         for some in _standing(connection):
             queries = stored_queries(connection, {e["subject"] for e in some}, store.folder / "blobs")
@@ -96,7 +97,7 @@ def each_query(store: Store) -> Iterator[list[Given]]:
 def _answers_to(connection: sql.Connection, ids: Collection[str]) -> Iterator[sql.Row[Any]]:
     """The events of the answers to some queries that stand, oldest first."""
     some = sql.select(event).join(standing, standing.c.seq == event.c.seq).where(standing.c.query.in_(ids))
-    yield from connection.execute(some.where(event.c.kind.in_(ANSWERS)).order_by(event.c.seq))
+    yield from connection.execute(some.where(event.c.kind.in_(OPINIONS)).order_by(event.c.seq))
 
 
 def knows_strengths(store: Store) -> bool:
@@ -108,7 +109,7 @@ def knows_strengths(store: Store) -> bool:
 
 def _standing(connection: sql.Connection) -> Iterator[list[Json]]:
     """The events of answers that stand, some at a time."""
-    for some in chunks((e for e in all_events(connection) if e["kind"] in ANSWERS), CHUNK):
+    for some in chunks((e for e in all_events(connection) if e["kind"] in OPINIONS), CHUNK):
         newest = words(connection, [(e["subject"], e["actor"]) for e in some])
         label = sql.select(asked.c.id).where(asked.c.id.in_({e["subject"] for e in some}), asked.c.purpose == "label")
         labels = set(connection.scalars(label))

@@ -27,6 +27,8 @@ from prefrl.exchange.exports.given import (
 )
 from prefrl.exchange.transcripts import Messages, prompt_messages, response_messages
 from prefrl.judgements import good, implied_pairs
+from prefrl.kinds import only
+from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Json, Response
 
@@ -143,6 +145,18 @@ def _unpaired(store: Store, tally: Tally, say: Conversations) -> Iterator[Json]:
             else:
                 row = {"prompt": say.prompt(response.prompt), "completion": say.response(response.text)}
                 yield row | {"label": label}
+
+
+def export_demonstrations(store: Store, path: Path) -> Exported:
+    """Write one JSON object a line with `prompt` and `completion`: every response that was shown.
+
+    Raises `StoreError` for demonstrations of control.
+    """
+    shown = store.demonstrations()
+    error = StoreError("demonstrations of control segments do not fit JSON lines; use --form bundle")
+    texts = only(Response, [one.like for one in shown], error)
+    rows = ({"prompt": text.prompt, "completion": text.text} for text in texts)
+    return Exported(write_lines(path, rows), {name: len(shown) for name in (LABELER, TIME) if shown})
 
 
 def export_judgements(store: Store, path: Path) -> Exported:
