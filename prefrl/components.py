@@ -80,6 +80,7 @@ TABLE: dict[Role, dict[str, str]] = {
     },
     "labelers": {
         "crowd": "prefrl.label.crowd:CrowdSettings",
+        "expert": "prefrl.label.expert:ExpertSettings",
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",
         "terminal": "prefrl.label.terminal:TerminalSettings",
@@ -95,6 +96,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "functions": "prefrl.reward_models.functions:FunctionsSettings",
     },
     "learners": {
+        "clone": "prefrl.improve.clone:CloneSettings",
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "cpl": "prefrl.improve.cpl:CPLSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",

@@ -18,6 +18,7 @@ from prefrl.components import ConfigError, Role, Settings, kinds, settings_class
 from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
+    Demonstrates,
     Labeler,
     LabelerSettings,
     Learner,
@@ -147,6 +148,8 @@ class Config(Settings):
         rng, select = streams(self.seed, 0).build, cast(SelectorSettings, self.select)
         task = self.build_task()
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
+        labeler = self.build_labeler(task)
+        self._check_candidates(labeler)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)
@@ -156,7 +159,7 @@ class Config(Settings):
             task=task,
             learner=learner,
             reward=reward,
-            labeler=self.build_labeler(task),
+            labeler=labeler,
             selector=select.build(),
             store=store,
             candidates=select.candidates,
@@ -165,6 +168,16 @@ class Config(Settings):
             seed=self.seed,
             threads=self.learner.threads if isinstance(self.learner, Threaded) else None,
         )
+
+    def _check_candidates(self, labeler: Labeler) -> None:
+        """Raises `ConfigError` where the labeler cannot answer about so many candidates."""
+        count, shows = cast(SelectorSettings, self.select).candidates, isinstance(labeler, Demonstrates)
+        if self.loop.labels and shows != (count == 1):
+            says = "shows what to do in the states of one" if shows else "compares two or more"
+            raise ConfigError(
+                f"select.candidates={count}, but the labeler ({self.labeler.model_dump()['kind']}) {says}: set "
+                f"select.candidates={1 if shows else 2}, or choose another labeler"
+            )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.
 

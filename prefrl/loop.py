@@ -17,7 +17,7 @@ from pydantic import Field
 from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
-from prefrl.protocols import Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
+from prefrl.protocols import Imitates, Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
 from prefrl.seeding import Streams, streams, threads
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
@@ -110,12 +110,17 @@ class Loop(Generic[C]):
             self.labeler.answer(self.store, rng.label)
         fitted = self._fit(rng, pool)
         improved: Metrics = {}
-        if self.reward.fitted:
+        if self.reward.fitted or self.imitates:
             if isinstance(self.learner, Paced):
                 self.learner.pace((number - 1) / self.settings.rounds, number / self.settings.rounds)
             with self._timed("improve"):
                 improved = self.learner.improve(self.reward, self.store, rng.improve)
         return self._finish(number, improved, self._evaluate(rng), fitted)
+
+    @property
+    def imitates(self) -> bool:
+        """Whether there is something to learn without a reward."""
+        return isinstance(self.learner, Imitates) and self.learner.imitates(self.store)
 
     def ask(self, count: int, rng: Streams) -> list[C]:
         """Stage 1: sample a pool, and ask about the part of it that is worth a label; returns the pool.
@@ -161,7 +166,7 @@ class Loop(Generic[C]):
             try:
                 fitted = (self.fit or fit)(self.reward, self.store, self.fitting, rng.fit, pool)
             except NothingToFit as error:  # people may not have answered yet: what is known stays
-                if self.settings.labels:
+                if self.settings.labels and not self.imitates:
                     self._notes.append(f"nothing to fit: {error}")
                 return None
         if self.fitting.held_out and not fitted.metrics["held_out"]:

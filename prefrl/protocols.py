@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from prefrl.components import ConfigError
-from prefrl.judgements import Answer, Judged
+from prefrl.judgements import Answer, Demonstrated, Judged
 from prefrl.kinds import RESPONSES, SEGMENTS
 from prefrl.seeding import Device
 from prefrl.types import Bools, C, C_contra, Evaluation, Fields, Floats, Metrics, Query, Response, Segment, State, Steps
@@ -260,6 +260,14 @@ class Swapping(Protocol[C_contra]):
         """Judge pairs of candidates of one context."""
 
 
+@runtime_checkable
+class Demonstrates(Protocol):
+    """A labeler that answers with behaviours, and so is asked about one candidate at a time."""
+
+    @property
+    def demonstrates(self) -> bool: ...
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 
@@ -303,11 +311,17 @@ class Store(Judgements[C], Protocol[C]):
     def ask(self, queries: Sequence[Query[C]]) -> None:
         """Add queries with their candidates; what is there already is left alone. Gold is filed apart."""
 
+    def keep(self, candidates: Sequence[C]) -> None:
+        """Add candidates that no query asks about: behaviours for demonstrations to show. Gold is filed apart."""
+
     def answer(self, answers: Sequence[Answer]) -> None:
         """Add answers, in one transaction; one per query and labeler: the first stands until it is retracted."""
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""
+
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[C]]:
+        """Queries with the behaviours that answer them, as `judged`."""
 
     def counts(self) -> dict[str, int]:
         """Queries asked, answered, skipped."""
@@ -545,6 +559,14 @@ class Learner(Protocol[C]):
     def state(self) -> State: ...
 
     def load(self, state: State) -> None: ...
+
+
+@runtime_checkable
+class Imitates(Protocol):
+    """A learner that may learn from demonstrations alone."""
+
+    def imitates(self, store: Store) -> bool:
+        """Whether it can now, without a reward."""
 
 
 @runtime_checkable

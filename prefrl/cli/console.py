@@ -112,9 +112,10 @@ def drive(running: Run) -> None:
             raise
         console.print(summary_table(running.summary))
         say(f"report: {running.report()}")
-        if not running.loop.reward.fitted:
+        if not (running.loop.reward.fitted or running.loop.imitates):
             raise ValueError(
-                "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
+                "nothing was learned: nothing was shown, and no judgement ever preferred a candidate; look at the "
+                "labeler's settings"
             )
 
 

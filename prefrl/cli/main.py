@@ -173,6 +173,28 @@ def label(
 
 
 @app.command()
+def demonstrate(
+    source: Annotated[str, typer.Argument(help="A preset of control, or a YAML file: where the expert acts.")],
+    overrides: Overrides = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")] = Path("demonstrations"),
+    expert: Annotated[
+        Path | None, typer.Option(help="Who acts: a run of control, or a zip. Default: the task's own expert.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, help="How many whole episodes are shown.")] = 4,
+    noise: Annotated[float, typer.Option(min=0, help="Std of what is executed beside it, in half the bounds.")] = 0.0,
+) -> None:
+    """Let an expert show whole episodes, which can be cloned: `learner.data=FOLDER` reads them."""
+    from prefrl import stages
+    from prefrl.cli.console import say
+
+    policy = [f"labeler.policy={json.dumps(str(expert))}"] if expert else []
+    shows = ["labeler.kind=expert", f"labeler.episodes={episodes}", f"labeler.noise={noise}", *policy]
+    stages.label(_load(source, [*shows, "select.candidates=1", "loop.labels=0", *(overrides or [])]), out, tell=say)
+    settings = f"learner.kind=clone learner.data={out} loop.labels=0 loop.rounds=1"
+    say(f"{_progress(out)}. Clone them with: prefrl run {source} {settings}")
+
+
+@app.command()
 def fit(
     source: Annotated[Path, typer.Argument(help="A folder with a store, or a file of judgements.")],
     overrides: Overrides = None,

@@ -1,4 +1,4 @@
-"""Behaviour from a file, judged or not: segments in an .npz, or the episodes of a Minari data set."""
+"""Recorded behaviour: segments in an .npz, the episodes of a Minari data set, or what a store's demonstrations show."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from prefrl.kinds import only
+from prefrl.storage.log import has_store
+from prefrl.store import Store
 from prefrl.types import Floats, Segment
 
 
@@ -20,7 +23,7 @@ class Recording(NamedTuple):
 
 
 def recording(path: Path) -> Recording:
-    """Read a file of segments or of pairs of them (.npz), or the folder of a Minari data set.
+    """Read a file of segments or of pairs of them (.npz), or the folder of a Minari data set or of demonstrations.
 
     Actions that are all one-hot are discrete. Raises `ValueError` for anything else, and where sizes differ.
     """
@@ -32,8 +35,12 @@ def recording(path: Path) -> Recording:
         from prefrl.exchange.minari_folders import episodes
 
         found, bounds = episodes(path)
+    elif has_store(path):
+        found, bounds = _demonstrated(path), None
     else:
-        raise ValueError(f"{path}: expected an .npz file of segments, or the folder of a Minari data set")
+        raise ValueError(
+            f"{path}: expected an .npz file of segments, or the folder of a Minari data set or of demonstrations"
+        )
     sizes = {(one.observations.shape[1], one.actions.shape[1]) for one in found}
     if len(sizes) != 1:
         got = " and ".join(map(str, sorted(sizes))) or "no segment"
@@ -42,6 +49,14 @@ def recording(path: Path) -> Recording:
     free = (np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32))
     discrete = size > 1 and all(_one_hot(one.actions) for one in found)
     return Recording(tuple(found), None if discrete else bounds or free)
+
+
+def _demonstrated(folder: Path) -> list[Segment]:
+    with Store[Segment](folder, write=False) as store:
+        shown = [one.like for one in store.demonstrations()]
+    if not shown:
+        raise ValueError(f"{folder} holds no demonstration: make some with prefrl demonstrate, or import them")
+    return only(Segment, shown, ValueError(f"{folder} holds demonstrations of text: expected those of control"))
 
 
 def _one_hot(actions: Floats) -> bool:

@@ -53,6 +53,8 @@ class DirectSettings(Settings):
     device: Device = "auto"
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     discount: ClassVar[float] = 1.0  # a response is judged as a whole
+    imitates: ClassVar[bool] = False
+    """Whether it learns from demonstrations, and so needs no judgement."""
 
     def with_evaluation_of(self, other: Self) -> Self:
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})
@@ -173,6 +175,9 @@ class Direct:
     @property
     def steps(self) -> Steps:
         return self._writer.steps
+
+    def imitates(self, store: Store[Response]) -> bool:
+        return self._settings.imitates and bool(store.demonstrations())
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Response]:
         return self._writer.ask(count, self._settings.asked_responses, rng)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Self, TypeAlias
+from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import torch
@@ -40,6 +40,8 @@ class OfflineSettings(Settings):
     """The settings that all these learners have; each one's class adds its kind and what is particular to it."""
 
     kind: str
+    imitates: ClassVar[bool] = False
+    """Whether it learns from what is shown alone, in every round, and needs no judgement."""
     data: Path | None = None
     """Behaviour to learn from beside what was judged: an .npz file of segments, or a Minari data set. What is asked
     about is cut from it as well. A task of kind `segments` has a file already."""
@@ -124,15 +126,20 @@ class Offline:
         rng: np.random.Generator,
         discount: float = 1.0,
         alpha: float | None = None,
+        learns_std: bool = False,
     ) -> None:
         self._settings, self._task, self._improve = settings, task, improve
         self._discount, self._alpha = discount, alpha
         network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
-        self.policy = MLPPolicy(network, task, rng, learns_std=False)
+        self.policy = MLPPolicy(network, task, rng, learns_std)
         self.policy.to(device_of(settings.device))
         self.optimizer = adam_of(self.policy, settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
         self._data = _data(settings.data, task)
+        self._seen = 0
+
+    def imitates(self, store: Store[Segment]) -> bool:
+        return self._settings.imitates and bool(self._data or store.demonstrations())
 
     @property
     def steps(self) -> Steps:
@@ -158,9 +165,12 @@ class Offline:
         held = batch([one for one, left in zip(judged, out, strict=True) if left])
         kept = batch([one for one, left in zip(judged, out, strict=True) if not left])
         apart = {one.id for one in held.candidates}
-        every = {one.id: one for one in (*kept.candidates, *self._data) if one.id not in apart}
+        shown = [one.like for one in store.demonstrations()] if store is not None else []
+        # What came first stands first: the normaliser sees what is new at the end.
+        known = (*self._data, *shown) if self._settings.imitates else (*kept.candidates, *shown, *self._data)
+        every = {one.id: one for one in known if one.id not in apart}
         if not every:
-            raise ValueError(f"{self._settings.kind} learns from segments: set learner.data, or import judged ones")
+            raise ValueError(_nothing(self._settings))
         material = Material(kept, tuple(every.values()))
         metrics = self._clone(material.segments, rng) | self._improve(self, material, reward, rng)
         self._player.rounds += 1
@@ -196,18 +206,20 @@ class Offline:
 
     def state(self) -> State:
         learned = {"policy": self.policy.state(), "optimizer": self.optimizer.state_dict()}
-        return learned | {"measured": self._measured} | self._player.state()
+        return learned | {"measured": self._measured, "seen": self._seen} | self._player.state()
 
     def load(self, state: State) -> None:
         self.policy.load(state["policy"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self._measured = state["measured"]
+        self._measured, self._seen = state["measured"], state.get("seen", 0)  # runs from before it was counted
         self._player.load(state)
 
     def _clone(self, segments: Sequence[Segment], rng: np.random.Generator) -> Metrics:
-        if self.policy.normaliser.count:
+        if self.policy.normaliser.count and not self._settings.imitates:
             return {}
-        self.policy.observe(np.concatenate([one.observations for one in segments]))
+        if new := segments[self._seen :]:
+            self.policy.observe(np.concatenate([one.observations for one in new]))
+        self._seen = len(segments)
         steps, settings = Recordings.of(segments, self.policy).decisions, self._settings
         found: list[Metrics] = []
         for _ in range(settings.cloning_epochs):
@@ -244,6 +256,12 @@ class Offline:
     def _act(self, rng: np.random.Generator | None) -> Act:
         actor = self.policy.numpy_actor()
         return lambda observations, legal, begins: actor(observations, rng, legal)
+
+
+def _nothing(settings: OfflineSettings) -> str:
+    if settings.imitates:
+        return f"{settings.kind} learns from demonstrations: set labeler.kind=expert or learner.data, or import some"
+    return f"{settings.kind} learns from segments: set learner.data, or import judged ones"
 
 
 def minibatches(count: int, epochs: int, size: int, rng: np.random.Generator) -> Iterator[Integers]:

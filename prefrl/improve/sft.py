@@ -1,15 +1,15 @@
-"""Supervised fine-tuning for text: the responses that were judged best are learned as if a person had written them.
+"""Supervised fine-tuning for text: what was shown, and what was judged best, is learned as if a person had written it.
 
 Variant: the mean of -log pi over the tokens of a minibatch, as before the reward in Stiennon et al. 2020. What is
-learned is each response that a judgement puts above another and below none, once however often it was judged. Left
-out: packing, a share of other texts.
+learned is each response of a demonstration, and each that a judgement puts above another and below none, once however
+often it was judged. Left out: packing, a share of other texts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -27,9 +27,11 @@ from prefrl.types import Integers, Metrics, Response
 
 
 class SFTSettings(DirectSettings):
-    """Supervised steps on the best responses of all judgements so far; nothing holds the policy near its start."""
+    """Supervised steps on demonstrations and on the best responses of all judgements so far; nothing holds the policy
+    near its start."""
 
     kind: Literal["sft"] = "sft"
+    imitates: ClassVar[bool] = True
     epochs: int = Field(1, ge=1)
     """Passes over these responses in a round."""
     minibatch: int = Field(16, ge=1)
@@ -43,7 +45,8 @@ class SFTSettings(DirectSettings):
 
     def formula(self) -> str:
         return (
-            "maximise  mean_t[ log pi(y_t) ]\ny: each response that was judged better than another, and worse than none"
+            "maximise  mean_t[ log pi(y_t) ]\n"
+            "y: each response that was shown, or was judged better than another and worse than none"
         )
 
 
@@ -56,19 +59,22 @@ def improve(
 ) -> Metrics:
     """Passes over the best responses. Metrics: means over steps of loss (nats per token) and grad_norm, and responses.
 
-    Raises ValueError where no judgement says which response is better.
+    Raises ValueError where nothing was shown, and no judgement says which response is better.
     """
     chosen = best_responses(store)
     if not chosen:
-        raise ValueError(f"{settings.kind} learns the better responses; no judgement names one: raise loop.labels")
+        raise ValueError(
+            f"{settings.kind} learns what was shown and the better responses; there is no demonstration, and no "
+            "judgement names a better one: import demonstrations, or raise loop.labels"
+        )
     rows = Responses.of(chosen, writer.policy.task, writer.policy.device)
     turns = [at for _ in range(settings.epochs) for at in shuffled(len(rows), settings.minibatch, rng)]
     return means(list(supervised(writer, settings, rows, writer.paced(turns)))) | {"responses": float(len(rows))}
 
 
 def best_responses(store: Store[Response]) -> list[Response]:
-    """Each response that some judgement puts above another and below none, in the order of the judgements."""
-    found: dict[str, Response] = {}
+    """Each response that was shown, and each that some judgement puts above another and below none, in order."""
+    found: dict[str, Response] = {one.like.id: one.like for one in store.demonstrations()}
     for one in store.judged():
         told = good(one.judgement, len(one.query.candidates))
         found |= {c.id: c for c, is_good in zip(one.query.candidates, told, strict=True) if is_good}

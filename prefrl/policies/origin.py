@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, cast
 
+import numpy as np
 import yaml
 from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
 from prefrl.policies.heads import ActionSpace
-from prefrl.policies.mlp import MLPPolicySettings
+from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings, NumpyActor
 from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, squashes, state_of
 from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.checkpoints import load_state, newest
@@ -31,19 +32,38 @@ def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings) -
 
     Raises `ConfigError` for a policy of other spaces, widths or noise, and for what is no policy of control.
     """
-    if not path.exists():
-        raise ConfigError(
-            f"learner.start: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip"
-        )
-    try:
-        found = _of_run(path) if path.is_dir() else _of_zip(path)
-    except ConfigError:
-        raise
-    except ValueError as error:
-        raise ConfigError(f"learner.start: {error}") from error
-    _check(found, path, task, settings.hidden)
+    who = "learner.start"
+    found = _found(path, who)
+    _check_spaces(found, path, task, who)
+    _check_widths(found, path, settings.hidden)
     _check_noise(found, path, settings)
     return found.state
+
+
+def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
+    """What acts as the policy of a run or of a zip does, whatever its widths; `who` names the setting that wants it.
+
+    Raises `ConfigError` as `starting_state` does.
+    """
+    found = _found(path, who)
+    _check_spaces(found, path, task, who)
+    parameters: Mapping[str, Tensor] = found.state["parameters"]
+    actor, critic = (tuple(_sizes(parameters, net)[1:-1]) for net in ("actor", "critic"))
+    log_std = parameters.get("log_std")
+    sde = log_std is not None and log_std.dim() == 2
+    settings = MLPPolicySettings(hidden=actor, critic_hidden=critic, squash=found.squash, sde=sde)
+    policy = MLPPolicy(settings, task, np.random.default_rng(0))  # its weights are written over
+    policy.load(found.state)
+    return policy.numpy_actor()
+
+
+def _found(path: Path, who: str) -> _Found:
+    if not path.exists():
+        raise ConfigError(f"{who}: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip")
+    try:
+        return _of_run(path) if path.is_dir() else _of_zip(path)
+    except ValueError as error:
+        raise ConfigError(f"{who}: {error}") from error
 
 
 def _of_zip(path: Path) -> _Found:
@@ -58,9 +78,9 @@ def _of_run(folder: Path) -> _Found:
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
     network = said["learner"].get("policy", {})
     if ours and (network.get("kind", "mlp"), network.get("activation", "tanh")) != ("mlp", "tanh"):
-        raise ConfigError(f"learner.start: {folder} has another network, {network}; expected kind mlp with tanh")
+        raise ConfigError(f"{folder} has another network, {network}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
-        raise ConfigError(f"learner.start: {folder} holds no policy of control that can be taken over; expected {OURS}")
+        raise ConfigError(f"{folder} holds no policy of control that can be taken over; expected {OURS}")
     task, squash = task_of(said), squashes(said["learner"])
     space = ActionSpace.within(task.action_size, task.action_bounds, squash)
     return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash)
@@ -72,17 +92,20 @@ def task_of(said: Json) -> ControlTask:
     return cast(ControlTask, cast(TaskSettings, settings).build())
 
 
-def _check(found: _Found, path: Path, task: ControlTask, hidden: tuple[int, ...]) -> None:
-    parameters: Mapping[str, Tensor] = found.state["parameters"]
-    there = [_sizes(parameters, net) for net in ("actor", "critic")]
-    seen, acts = there[0][0], there[0][-1]
+def _check_spaces(found: _Found, path: Path, task: ControlTask, who: str) -> None:
+    sizes = _sizes(found.state["parameters"], "actor")
+    seen, acts = sizes[0], sizes[-1]
     if (seen, acts) != (task.observation_size, task.action_size) or not same_bounds(found.bounds, task.action_bounds):
         here = _told(task.observation_size, task.action_size, task.action_bounds)
         came = _told(seen, acts, found.bounds)
         raise ConfigError(
-            f"learner.start: expected a policy for {task.name}, with {here}; {path} has one with {came}: start from "
-            "another one, or choose the task that it was made for"
+            f"{who}: expected a policy for {task.name}, with {here}; {path} has one with {came}: take another one, or "
+            "choose the task that it was made for"
         )
+
+
+def _check_widths(found: _Found, path: Path, hidden: tuple[int, ...]) -> None:
+    there = [_sizes(found.state["parameters"], net) for net in ("actor", "critic")]
     widths = [tuple(sizes[1:-1]) for sizes in there]
     if widths[0] != widths[1]:
         raise ConfigError(
@@ -116,4 +139,4 @@ def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
     return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
-__all__ = ["starting_state", "task_of"]
+__all__ = ["actor_of", "starting_state", "task_of"]

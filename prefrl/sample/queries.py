@@ -28,7 +28,7 @@ def groups(pool: Sequence[C], size: int, rng: np.random.Generator) -> Integers:
 
     The candidates of a pool are distinct. Each stands in at most one query, so that no query repeats or half-repeats
     another, and never beside one that it overlaps: what they share says nothing. Candidates left without enough
-    others are dropped.
+    others are dropped. Of single candidates no two that overlap are asked about.
     """
     by_context: dict[str, list[int]] = defaultdict(list)
     for i, candidate in enumerate(pool):
@@ -42,6 +42,8 @@ def groups(pool: Sequence[C], size: int, rng: np.random.Generator) -> Integers:
 
 def _first_fit(pool: Sequence[C], members: Sequence[int], size: int) -> list[list[int]]:
     """Each candidate joins the first open group without one that it overlaps, else it opens a group."""
+    if size == 1:
+        return _apart(pool, members)
     found: list[list[int]] = []
     opened: list[list[int]] = []  # few: whoever opened the newest overlaps a member of each
     for i in members:
@@ -52,6 +54,15 @@ def _first_fit(pool: Sequence[C], members: Sequence[int], size: int) -> list[lis
         opened[at].append(i)
         if len(opened[at]) == size:
             found.append(opened.pop(at))
+    return found
+
+
+def _apart(pool: Sequence[C], members: Sequence[int]) -> list[list[int]]:
+    """Each candidate that overlaps none before it: nobody is to show twice what to do in the same state."""
+    found: list[list[int]] = []
+    for i in members:
+        if not any(overlap(pool[i], pool[j]) for (j,) in found):
+            found.append([i])
     return found
 
 

@@ -27,8 +27,8 @@ class UnscoredSettings(Settings):
 
     kind: Literal["uniform", "coverage"] = "uniform"
     """At random, or about queries that are far from one another (greedy k-center)."""
-    candidates: int = Field(2, ge=2, le=8)
-    """K: how many candidates a query puts side by side."""
+    candidates: int = Field(2, ge=1, le=8)
+    """K: how many candidates a query puts side by side; 1 for an expert, who shows what to do instead."""
     newest: float = Field(1.0, gt=0, le=1)
     """The share of the pool, from its end where the newest are, that may be asked about."""
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from prefrl.envs.text import Reviews
 from prefrl.improve.direct import Direct
 from prefrl.improve.dpo import DPOSettings
-from prefrl.judgements import Comparison, Judged
+from prefrl.judgements import Comparison, Demonstrated, Judged
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task
 from prefrl.types import Floats, Metrics, Query, Response
@@ -42,6 +42,9 @@ class Answers:
         pairs = [Query((a, b)) for a, b in zip(candidates[::2], candidates[1::2], strict=True) if a.id != b.id]
         leads = [float(-np.diff(reward.score(query.candidates))[0]) for query in pairs]
         self._judged = [Judged(q, Comparison(q.id, answer(lead))) for q, lead in zip(pairs, leads, strict=True)]
+
+    def demonstrations(self) -> list[Demonstrated[Response]]:
+        return []
 
     def judged(self) -> list[Judged[Response]]:
         return self._judged

@@ -36,6 +36,9 @@ class Answers:
     def judged(self, upto: int | None = None) -> list[Judged[Segment]]:
         return self._judged
 
+    def demonstrations(self) -> list[Any]:
+        return []
+
 
 def recorded(count: int, seed: int = 0, discrete: bool = False, steps: int = 5) -> list[Segment]:
     """Random pushes of the point, of which the gold knows how good they are."""

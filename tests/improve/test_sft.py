@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -14,9 +15,10 @@ from preferred import LIKES, NO_REWARD, SMALL
 from prefrl.envs.text import Reviews
 from prefrl.improve.direct import Direct
 from prefrl.improve.sft import SFTSettings, best_responses
-from prefrl.judgements import Comparison, Judged, Judgement, Ranking
+from prefrl.judgements import Comparison, Demonstration, Judged, Judgement, Ranking
 from prefrl.policies.responses import Responses
 from prefrl.protocols import Store
+from prefrl.store import Store as Kept
 from prefrl.types import Query, Response
 
 
@@ -41,6 +43,9 @@ def told(candidates: Sequence[Response], *judgements: Any) -> Store[Response]:
         def judged(self) -> list[Judged[Response]]:
             made: list[Judgement] = [make(query.id) for make in judgements]
             return [Judged(query, one) for one in made]
+
+        def demonstrations(self) -> list[Any]:
+            return []
 
     return cast("Store[Response]", Told())
 
@@ -96,5 +101,20 @@ def test_the_size_of_a_chunk_changes_rounding_alone(toy_reviews: Reviews, judged
 def test_ties_alone_teach_nothing_and_that_is_said(toy_reviews: Reviews) -> None:
     one = learner(toy_reviews)
     store = preferred.answers(one.sample(8, np.random.default_rng(0)), LIKES, lambda lead: 0.5)
-    with pytest.raises(ValueError, match=r"sft learns the better responses.*raise loop\.labels"):
+    with pytest.raises(ValueError, match=r"sft learns what was shown and the better responses.*raise loop\.labels"):
         one.improve(NO_REWARD, store, np.random.default_rng(0))
+
+
+def test_demonstrations_are_learned_without_any_judgement(toy_reviews: Reviews, tmp_path: Path) -> None:
+    one = learner(toy_reviews, epochs=4)
+    (written,) = one.policy.respond(["The plot was"], 1, np.random.default_rng(0)).candidates(toy_reviews.tokenizer)
+    with Kept[Response](tmp_path) as store:
+        assert not one.imitates(store)
+        query = Query((written,))
+        store.ask([query])
+        store.answer([Demonstration(query.id, written.id, "ann")])
+        assert one.imitates(store)
+        first = one.improve(NO_REWARD, store, np.random.default_rng(1))
+        second = one.improve(NO_REWARD, store, np.random.default_rng(2))
+    assert first["responses"] == 1
+    assert second["loss"] < first["loss"]

@@ -1,0 +1,133 @@
+"""An expert who answers with behaviour: "in these states I would have done this".
+
+Variant: DAgger (Ross et al. 2011, algorithm 3.1) with the expert alone in control of its own first episodes and the
+learner alone from then on (their beta_i = I(i = 1)); noise as in DART (Laskey et al. 2017) with a fixed width. Left
+out: mixtures of both within one episode, and noise that is fitted to the learner's errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from pydantic import Field
+
+from prefrl.components import ConfigError, Settings
+from prefrl.envs.experts import EXPERTS
+from prefrl.judgements import Demonstration
+from prefrl.policies.origin import actor_of
+from prefrl.policies.rollout import whole_episodes
+from prefrl.protocols import ControlTask, Store, Task, simulated
+from prefrl.sample.segments import segment
+from prefrl.types import Bools, Floats, Query, Segment
+
+Advice: TypeAlias = Callable[[Floats], Floats]
+"""Observations (n, O) -> the expert's actions (n, A), within the bounds, or one-hot."""
+
+
+class ExpertSettings(Settings):
+    """Show what to do: whole episodes at first, then the right actions in the states that the learner came to."""
+
+    kind: Literal["expert"] = "expert"
+    name: str = Field("expert", min_length=1)
+    """Who shows; kept with every answer."""
+    policy: Path | None = None
+    """Whose actions they are: the folder of a run of control, or a zip of stable-baselines3. Null for the expert that
+    is known for the task, which Pendulum-v1 has."""
+    episodes: int = Field(4, ge=0)
+    """Whole episodes of the expert's own, shown before anything is asked."""
+    noise: float = Field(0.0, ge=0)
+    """Of what is executed in these episodes, as a std in half the action bounds, or for discrete actions the share that
+    is drawn at random. What is shown are the actions without it: so the learner sees how to come back."""
+
+    def build(self, task: Task) -> Expert:
+        found = simulated(task, f"labeler kind {self.kind!r} acts in control tasks")
+        return Expert(self, found, advice_of(self.policy, found))
+
+
+@dataclass(frozen=True)
+class Expert:
+    """A `Labeler` of segments."""
+
+    settings: ExpertSettings
+    task: ControlTask
+    advice: Advice
+    demonstrates: bool = True
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
+
+    def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
+        """Show the episodes, once, then answer every open query with what the expert does in its states."""
+        self._show(store, rng)
+        queries = store.open_queries(self.name)
+        shown = [self._corrected(query) for query in queries]
+        store.keep(shown)
+        store.answer([Demonstration(q.id, s.id, self.name) for q, s in zip(queries, shown, strict=True)])
+
+    def _show(self, store: Store[Segment], rng: np.random.Generator) -> None:
+        if not self.settings.episodes or self._has_shown(store):
+            return
+        queries = [Query((one,)) for one in play(self.task, self.advice, self.settings, rng)]
+        store.ask(queries)
+        # In the same order, so that a round that was killed in between, and is done again, goes on from there.
+        store.answer([Demonstration(q.id, q.candidates[0].id, self.name) for q in queries])
+
+    def _has_shown(self, store: Store[Segment]) -> bool:
+        own = (d.demonstration for d in store.demonstrations() if d.like.id == d.query.candidates[0].id)
+        return any(one.labeler == self.name for one in own)
+
+    def _corrected(self, query: Query[Segment]) -> Segment:
+        """The same states, with the expert's actions. Nothing is known of what they would have led to."""
+        if len(query.candidates) > 1:
+            raise ValueError(
+                f"query {query.id[:12]} compares {len(query.candidates)} segments, and an expert answers with actions "
+                "in the states of one: set select.candidates=1, or let another labeler answer"
+            )
+        (own,) = query.candidates
+        return replace(own, actions=self.advice(own.observations).astype(np.float32), gold=None)
+
+
+def advice_of(policy: Path | None, task: ControlTask) -> Advice:
+    """The mode of a saved policy, or the expert known for the task. Raises `ConfigError` where there is none."""
+    if policy is not None:
+        actor = actor_of(policy, task, "labeler.policy")
+        return lambda observations: actor(observations, None)[1]
+    if task.name not in EXPERTS:
+        raise ConfigError(
+            f"labeler.policy: no expert is known for {task.name}, only for {', '.join(EXPERTS)}: name a run of control "
+            "or a zip of stable-baselines3"
+        )
+    return EXPERTS[task.name]
+
+
+def play(task: ControlTask, advice: Advice, settings: ExpertSettings, rng: np.random.Generator) -> Sequence[Segment]:
+    """Whole episodes in which the expert acts, with noise, and which hold what it would have done without."""
+    episodes = settings.episodes
+    noise = np.random.default_rng(rng.integers(2**63))
+
+    def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
+        clean = advice(observations)
+        return clean, _disturbed(clean, task, settings.noise, noise)
+
+    rollout = whole_episodes(task, act, episodes, rng)
+    shown = replace(rollout, actions=rollout.choices)
+    # A row may go on after its first end.
+    lengths = rollout.ends.argmax(1) + 1
+    return [segment(shown, i, 0, int(lengths[i]), settings.name) for i in range(episodes)]
+
+
+def _disturbed(actions: Floats, task: ControlTask, width: float, rng: np.random.Generator) -> Floats:
+    if not width:
+        return actions
+    if task.action_bounds is None:
+        drawn = np.eye(task.action_size, dtype=np.float32)[rng.integers(task.action_size, size=len(actions))]
+        return np.where(rng.random((len(actions), 1)) < width, drawn, actions)
+    low, high = task.action_bounds
+    noisy = actions + width * (high - low) / 2 * rng.standard_normal(actions.shape)
+    found: Floats = np.clip(noisy, low, high).astype(np.float32)
+    return found

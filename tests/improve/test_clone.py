@@ -1,0 +1,177 @@
+"""Behavioural cloning: its gradient, what it learns, corrections that help, and what it never looks at."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from control_stubs import Known, point
+
+from prefrl.envs.control import GymnasiumTask
+from prefrl.improve.clone import CloneSettings
+from prefrl.improve.offline import Offline, Recordings
+from prefrl.judgements import Demonstration
+from prefrl.label.expert import Advice, Expert, ExpertSettings
+from prefrl.protocols import Store as Kept
+from prefrl.store import Store
+from prefrl.types import Floats, Query, Segment, State
+
+SMALL: dict[str, Any] = {"hidden": [16], "learning_rate": 1e-2, "evaluation_episodes": 8, "cloning_epochs": 60}
+
+
+def to_the_middle(observations: Floats) -> Floats:
+    """Of the point on a line: as far as one push goes."""
+    found: Floats = np.clip(-5.0 * observations, -1.0, 1.0).astype(np.float32)
+    return found
+
+
+def push_to_the_middle(observations: Floats) -> Floats:
+    found: Floats = np.eye(2, dtype=np.float32)[(observations[:, 0] < 0).astype(int)]
+    return found
+
+
+def learner(task: GymnasiumTask, seed: int = 0, **settings: object) -> Offline:
+    return CloneSettings.model_validate(SMALL | settings).build(task, np.random.default_rng(seed))
+
+
+def shown(folder: Path, task: GymnasiumTask, advice: Advice, **settings: object) -> Kept[Segment]:
+    store = Store[Segment](folder)
+    Expert(ExpertSettings.model_validate(settings), task, advice).answer(store, np.random.default_rng(1))
+    return store
+
+
+def gold(one: Offline) -> float:
+    return one.evaluate(cast(Any, Known()), np.random.default_rng(3)).metrics["gold"]
+
+
+@pytest.mark.parametrize(("discrete", "advice"), [(False, to_the_middle), (True, push_to_the_middle)])
+def test_a_clone_does_what_was_shown(tmp_path: Path, discrete: bool, advice: Advice) -> None:
+    task = point(discrete=discrete)
+    one = learner(task)
+    before = gold(one)
+    metrics = one.improve(cast(Any, Known()), shown(tmp_path, task, advice, episodes=4), np.random.default_rng(0))
+    assert metrics["demonstrations"] == 4
+    seen = np.linspace(-1, 1, 21, dtype=np.float32)[:, None]
+    actions, _ = one.actor()(seen, None, None)
+    if discrete:
+        assert (actions.argmax(1) == advice(seen).argmax(1))[np.abs(seen[:, 0]) > 0.3].all()
+    else:
+        assert np.abs(actions - advice(seen)).mean() < 0.15
+    assert gold(one) > before
+
+
+def test_the_gradient_is_that_of_the_likelihood_of_every_step() -> None:
+    task = point()
+    one = learner(task, max_grad_norm=1e9)
+    seen = np.random.default_rng(0).uniform(-1, 1, (2, 6, 1)).astype(np.float32)
+    segments = [Segment(rows, to_the_middle(rows), f"e{i}", 0) for i, rows in enumerate(seen)]
+    one.policy.observe(np.concatenate([s.observations for s in segments]))
+    steps = Recordings.of(segments, one.policy).decisions
+    one.descend(steps, np.arange(12), one._surprise)
+    (own,) = one.policy.parameters()
+    again = learner(task)
+    again.policy.observe(np.concatenate([s.observations for s in segments]))
+    (weights,) = again.policy.parameters()
+    (by_torch,) = torch.autograd.grad(-again.policy.log_prob(steps)[0].mean(), weights)
+    torch.testing.assert_close(own.grad, by_torch, rtol=1e-5, atol=1e-6)
+
+
+def test_corrections_in_its_own_states_are_learned_with_what_was_shown(tmp_path: Path) -> None:
+    """DAgger: the expert shows one side alone, and the learner learns the other when it is corrected there."""
+    task = point()
+    one, store = learner(task, cloning_epochs=200), Store[Segment](tmp_path)
+    seen = np.linspace(0.2, 1.0, 20, dtype=np.float32)[:, None]
+    right = Segment(seen, to_the_middle(seen), "right", 0)
+    query = Query((right,))
+    store.ask([query])
+    store.answer([Demonstration(query.id, right.id, "expert")])
+    one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    left = -seen
+
+    def error() -> float:
+        actions, _ = one.actor()(left, None, None)
+        return float(np.abs(actions - to_the_middle(left)).mean())
+
+    before = error()
+    store.ask([Query((Segment(left, np.zeros((20, 1), np.float32), "own", 0),))])
+    Expert(ExpertSettings(episodes=0), task, to_the_middle).answer(store, np.random.default_rng(1))
+    one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    assert before > 0.5
+    assert error() < 0.15
+
+
+def test_the_normaliser_sees_each_demonstration_once(tmp_path: Path) -> None:
+    one, store = learner(point(), cloning_epochs=1), shown(tmp_path, point(), to_the_middle, episodes=2)
+    one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    count = one.policy.normaliser.count
+    one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    assert one.policy.normaliser.count == count > 0
+
+
+def test_gold_is_never_looked_at(tmp_path: Path) -> None:
+    task, found = point(), list[State]()
+    for name, hidden in (("seen", False), ("hidden", True)):
+        store = shown(tmp_path / name, task, to_the_middle, episodes=2)
+        if hidden:
+            store = cast(Any, _Hidden(store))
+        one = learner(task, cloning_epochs=2)
+        one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+        found.append(one.policy.state())
+    for name, weights in found[0]["parameters"].items():
+        assert torch.equal(weights, found[1]["parameters"][name])
+
+
+class _Hidden:
+    """A store whose candidates carry a gold that is no number."""
+
+    def __init__(self, inner: Kept[Segment]) -> None:
+        self._inner = inner
+
+    def judged(self) -> list[Any]:
+        return []
+
+    def demonstrations(self) -> list[Any]:
+        inner = self._inner.demonstrations()
+        return [replace(one, like=replace(one.like, gold=np.full(len(one.like), np.nan))) for one in inner]
+
+
+def test_a_resumed_clone_goes_on_alike(tmp_path: Path) -> None:
+    task, store = point(), shown(tmp_path, point(), to_the_middle, episodes=2)
+    one = learner(task, cloning_epochs=2)
+    one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    other = learner(task, seed=9, cloning_epochs=2)
+    other.load(deepcopy(one.state()))
+    for each in (one, other):
+        each.improve(cast(Any, Known()), store, np.random.default_rng(5))
+    for name, weights in one.policy.state()["parameters"].items():
+        assert torch.equal(weights, other.policy.state()["parameters"][name])
+
+
+def test_with_nothing_shown_it_says_what_to_do(tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store, pytest.raises(ValueError, match="clone learns from demonstrations: set"):
+        learner(point()).improve(cast(Any, Known()), store, np.random.default_rng(0))
+
+
+def test_one_step_is_enough_to_clone(tmp_path: Path) -> None:
+    seen = np.ones((1, 1), np.float32)
+    one, query = learner(point(), cloning_epochs=2), Query((Segment(seen, -seen, "e", 0),))
+    with Store[Segment](tmp_path) as store:
+        store.ask([query])
+        store.answer([Demonstration(query.id, query.candidates[0].id, "ann")])
+        assert np.isfinite(one.improve(cast(Any, Known()), store, np.random.default_rng(0))["cloning_loss"])
+
+
+def test_a_learned_std_narrows_where_the_expert_is_sure(tmp_path: Path) -> None:
+    task, store = point(), shown(tmp_path, point(), to_the_middle, episodes=4)
+    stds = []
+    for learned in (False, True):
+        one = learner(task, learn_std=learned)
+        one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+        stds.append(float(one.policy.state()["parameters"]["log_std"].exp()))
+    assert stds[0] == pytest.approx(0.7)
+    assert stds[1] < 0.3
