@@ -135,7 +135,7 @@ def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
     assert prefrl("label control/toy loop.labels=6 --out labels") == 0
     assert prefrl("export labels --to bundle --form bundle") == 0
     assert prefrl("import bundle --out copy") == 0
-    assert "6 judgements" in prefrl.out
+    assert "6 answers" in prefrl.out
     assert prefrl("fit copy --config control/toy --out reward") == 0
     assert prefrl("export labels --to out.jsonl") == 2
     assert "--form bundle" in prefrl.err

@@ -69,7 +69,7 @@ def test_an_export_of_nothing_fails(prefrl: Command) -> None:
 
 def test_a_dry_run_writes_nothing(prefrl: Command) -> None:
     code, printed = prefrl("import in.jsonl --out labels --dry-run")
-    assert (code, "1 judgements would be read" in printed) == (0, True)
+    assert (code, "1 answers would be read" in printed) == (0, True)
     assert not Path("labels").exists()
     prefrl("import in.jsonl --out labels")
     assert prefrl("import in.jsonl --out labels --dry-run")[0] == 0
