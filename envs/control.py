@@ -69,11 +69,13 @@ class ControlSettings(Settings):
     step_seconds: float | None = Field(None, gt=0)
     """End the process, with status 124, when a step or a reset of one environment takes longer; null waits for ever.
     The environments with steppers of our own are not watched."""
+    threads: int = Field(1, ge=1)
+    """On how many threads MuJoCo's bodies are stepped, those with a stepper of our own; nothing else changes by it."""
     fps: float | None = Field(None, gt=0)
     """Control steps per simulated second; only needed where the environment does not say."""
 
     def lasting(self) -> ControlSettings:
-        return self.model_copy(update={"step_seconds": None})
+        return self.model_copy(update={"step_seconds": None, "threads": 1})
 
     def identity(self) -> ControlSettings:
         return self.lasting()
@@ -88,7 +90,7 @@ class ControlSettings(Settings):
         name = self.env if plain is single and not self.options else ""
         action, size = env.action_space, math.prod(env.observation_space.shape or ())
         after: AfterEnd = "end" if self.variable_horizon else self.after_end
-        environments = partial(_environments, name, plain, horizon, after, self.step_seconds)
+        environments = self._stepper(name, plain, horizon, after)
         if self.hide or self.flicker or self.stack > 1:
             environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)
         # Blindness is drawn for all at once.
@@ -110,6 +112,22 @@ class ControlSettings(Settings):
             notes=notes,
             options=self.options,
         )
+
+    def _stepper(self, name: str, single: Make, horizon: int, after: AfterEnd) -> Callable[..., Environments]:
+        """What makes n environments, or those in `mine` of n, by the fastest stepper there is."""
+        if name in BODIES and after != "restart":  # which the fast ones do not know within an episode
+            from prefrl.envs.fast.simulated import Simulated
+
+            options: dict[str, Any] = {"fixed_horizon": after != "end", "threads": self.threads}
+            return partial(Simulated, name, single, horizon=horizon, **options)
+        if self.threads > 1:
+            raise ConfigError(
+                f"task.threads={self.threads}: only {', '.join(BODIES)} are stepped on several threads, without "
+                f"task.options and task.after_end=restart; leave task.threads=1 for this {self.env}"
+            )
+        if name in WORLDS and after != "restart":
+            return partial(Vectorised, WORLDS[name](after == "end"), horizon=horizon)
+        return partial(Wrapped, single, horizon=horizon, after=after, step_seconds=self.step_seconds)
 
     def _make(self) -> tuple[Make, gymnasium.Env[Any, Any]]:
         # Looked up here, not by gymnasium: an id "module:name" would make it import code that a config names.
@@ -197,7 +215,8 @@ class GymnasiumTask:
     fps: float
     frame_size: int
     make: Callable[[int], Environments]
-    part: Callable[[int, range], Environments] | None = None
+    part: Callable[..., Environments] | None = None
+    """As `make`, but for those in `mine`."""
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     """The environment's keyword arguments, for drawing."""
@@ -210,32 +229,12 @@ class GymnasiumTask:
         return self.make(count)
 
     def some_environments(self, count: int, which: range) -> Environments | None:
-        return None if self.part is None else self.part(count, which)
+        return None if self.part is None else self.part(count, mine=which)
 
     def frames(self, segment: Segment) -> np.ndarray:
         from prefrl.envs.render import frames
 
         return frames(self.name, segment, self.frame_size, self.options)
-
-
-def _environments(
-    name: str,
-    single: Make,
-    horizon: int,
-    after: AfterEnd,
-    seconds: float | None,
-    count: int,
-    which: range | None = None,
-) -> Environments:
-    """The fastest stepper there is for an environment."""
-    if name in WORLDS and after != "restart":  # which the fast ones do not know within an episode
-        assert which is None
-        return Vectorised(WORLDS[name](after == "end"), count, horizon)
-    if name in BODIES and after != "restart":
-        from prefrl.envs.fast.simulated import Simulated
-
-        return Simulated(name, single, count, horizon, after != "end", which)
-    return Wrapped(single, count, horizon, after, seconds, which)
 
 
 def _can_be_parted(name: str, after: AfterEnd) -> bool:
@@ -254,9 +253,10 @@ def _partial(
     hide: tuple[int, ...],
     flicker: float,
     stack: int,
-    *which: Any,
+    count: int,
+    **mine: range,
 ) -> Environments:
-    return Partial(make(*which), size, hide, flicker, stack)
+    return Partial(make(count, **mine), size, hide, flicker, stack)
 
 
 def _keywords(env: type) -> list[str]:

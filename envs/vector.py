@@ -72,6 +72,7 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
     Observations, terminations, truncations and first states are `SyncVectorEnv`'s to the bit for the same seeds,
     rewards too; Pendulum's rewards and Acrobot's first observations are to rounding. Episodes end where gymnasium ends
     them: a fixed horizon is the control task's. `terminate_when_unhealthy=False` lets Ant, Hopper and Walker2d go on.
+    MuJoCo's are stepped on `threads`, which change nothing else.
 
     Infos hold `final_obs` (with `autoreset_mode="SameStep"`), as gymnasium's do, and nothing else: the parts of a
     reward and a body's place are not computed. Nothing is drawn. Raises `ValueError` for an option that it does not
@@ -85,18 +86,22 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         terminate_when_unhealthy: bool | None = None,
+        threads: int = 1,
         **others: Any,
     ) -> None:
         others = {key: value for key, value in others.items() if (key, value) != ("render_mode", None)}
-        stops_by_option = name in ("Ant-v5", "Hopper-v5", "Walker2d-v5")
-        _check_options(name, others, num_envs, terminate_when_unhealthy is not None and not stops_by_option)
+        if threads != 1 and name not in BODIES:
+            others["threads"] = threads
+        if terminate_when_unhealthy is not None and name not in ("Ant-v5", "Hopper-v5", "Walker2d-v5"):
+            others["terminate_when_unhealthy"] = terminate_when_unhealthy
+        _check_options(name, others, num_envs, threads)
         env: Any = make(name, disable_env_checker=True).unwrapped
         self.num_envs, self._mode = num_envs, AutoresetMode(autoreset_mode)
         self.metadata = {**env.metadata, "autoreset_mode": self._mode}
         self.single_observation_space, self.single_action_space = env.observation_space, env.action_space
         self.observation_space = batch_space(env.observation_space, num_envs)
         self.action_space = batch_space(env.action_space, num_envs)
-        self._stepper = _stepper(name, env, num_envs)
+        self._stepper = _stepper(name, env, num_envs, threads)
         self._limit = max_episode_steps or gymnasium.registry[name].max_episode_steps
         # Not by health: these go on whatever falls.
         self._ends = terminate_when_unhealthy is not False
@@ -175,25 +180,27 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
         return given.astype(space.dtype, copy=False)
 
 
-def _stepper(name: str, env: Any, count: int) -> _Stepper:
+def _stepper(name: str, env: Any, count: int, threads: int) -> _Stepper:
     if name in CLASSIC:
         space = env.action_space
         return _Worlds(CLASSIC[name], count, int(space.n) if isinstance(space, gymnasium.spaces.Discrete) else None)
     from prefrl.envs.fast.simulated import Bodies
 
-    return Bodies(name, env, count)
+    return Bodies(name, env, count, threads)
 
 
-def _check_options(name: str, others: dict[str, Any], count: int, cannot_go_on: bool) -> None:
+def _check_options(name: str, unknown: dict[str, Any], count: int, threads: int) -> None:
     if name not in NAMES:
         raise ValueError(f"{name!r} has no fast stepper; {suggest(name, NAMES)}")
     if count < 1:
         raise ValueError(f"num_envs must be at least 1, got {count}")
-    unknown = [*others, *(["terminate_when_unhealthy"] if cannot_go_on else [])]
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
     if unknown:
         raise ValueError(
-            f"the fast stepper of {name} has no option {unknown[0]!r} (it has max_episode_steps, autoreset_mode and, "
-            f'for Ant, Hopper and Walker2d, terminate_when_unhealthy); gymnasium.make_vec("{name}", ...) has its own'
+            f"the fast stepper of {name} has no option {next(iter(unknown))!r} (it has max_episode_steps, "
+            "autoreset_mode, for MuJoCo's threads and, for Ant, Hopper and Walker2d, terminate_when_unhealthy); "
+            f'gymnasium.make_vec("{name}", ...) has its own'
         )
 
 

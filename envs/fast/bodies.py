@@ -38,7 +38,7 @@ def _always(now: Snapshot) -> Bools:
     return np.ones(len(now.positions), bool)
 
 
-def _nothing(data: Any) -> list[Floats]:
+def _nothing(batch: Any) -> list[Floats]:
     return []
 
 
@@ -56,9 +56,9 @@ class Body:
     place: Callable[[Snapshot], Floats] = _first_position
     """(n,): how far a body has come, of which the speed forward is taken."""
     derived: Callable[[Any], list[Floats]] = _nothing
-    """Views into the memory of one `MjData`: what else is observed or rewarded."""
+    """(n, .) arrays that a `mujoco.batch.Batch` keeps up to date: what else is observed or rewarded."""
     contact_forces: bool = False
-    """Whether `cfrc_ext` is among them, which MuJoCo computes only when it is asked to."""
+    """Whether `cfrc_ext` comes after them, which MuJoCo computes only when it is asked to."""
 
 
 def _noise(
@@ -114,8 +114,8 @@ def _upright(
     return healthy & small
 
 
-def _ant_derived(data: Any) -> list[Floats]:
-    return [data.body(1).xpos, data.cfrc_ext]
+def _ant_derived(batch: Any) -> list[Floats]:
+    return [batch.body(1).xpos]
 
 
 def _ant_place(now: Snapshot) -> Floats:
@@ -161,8 +161,8 @@ def _reacher_start(positions: Floats, velocities: Floats, rng: np.random.Generat
     return positions, velocities
 
 
-def _reacher_derived(data: Any) -> list[Floats]:
-    return [data.body("fingertip").xpos, data.body("target").xpos]
+def _reacher_derived(batch: Any) -> list[Floats]:
+    return [batch.body("fingertip").xpos, batch.body("target").xpos]
 
 
 def _reacher_observe(now: Snapshot) -> Floats:
@@ -188,8 +188,8 @@ def _pusher_start(positions: Floats, velocities: Floats, rng: np.random.Generato
     return positions, velocities
 
 
-def _pusher_derived(data: Any) -> list[Floats]:
-    return [data.body("tips_arm").xpos, data.body("object").xpos, data.body("goal").xpos]
+def _pusher_derived(batch: Any) -> list[Floats]:
+    return [batch.body(name).xpos for name in ("tips_arm", "object", "goal")]
 
 
 def _pusher_observe(now: Snapshot) -> Floats:
@@ -217,8 +217,8 @@ def _pole_reward(now: Snapshot, actions: Floats, speed: Floats, healthy: Bools) 
     return healthy.astype(np.float64)
 
 
-def _poles_derived(data: Any) -> list[Floats]:
-    return [data.site("tip").xpos, data.qfrc_constraint]
+def _poles_derived(batch: Any) -> list[Floats]:
+    return [batch.site("tip").xpos, batch.qfrc_constraint]
 
 
 def _poles_observe(now: Snapshot) -> Floats:

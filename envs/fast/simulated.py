@@ -1,17 +1,20 @@
-"""gymnasium's MuJoCo environments (v5): one preallocated MjData each, the rest in batched NumPy.
+"""gymnasium's MuJoCo environments (v5): `mujoco.batch` steps the simulators, on as many threads as wanted; the rest is
+batched NumPy.
 
-Equal to gymnasium's environments to the bit. Stepping many at once with `mujoco.rollout` would not be: called for one
-control step at a time it loses the solver's warm start.
+Equal to gymnasium's environments to the bit, whatever the number of threads. Stepping many at once with
+`mujoco.rollout` would not be: called for one control step at a time it loses the solver's warm start.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import os
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from prefrl.envs.fast.bodies import BODIES, Snapshot
 from prefrl.protocols import Transition
@@ -21,50 +24,59 @@ from prefrl.types import Bools, Floats
 class Bodies:
     """n simulators of a body of `prefrl.envs.fast.bodies`, each started and advanced when it is asked to.
 
-    `env` is the gymnasium environment whose model and first state are used.
+    `env` is the gymnasium environment whose model and first state are used. The threads, that of the caller among
+    them, last as long as this does.
     """
 
-    def __init__(self, name: str, env: Any, count: int) -> None:
+    def __init__(self, name: str, env: Any, count: int, threads: int = 1) -> None:
         self._body = BODIES[name]
-        self._model = env.model
-        self._frames = env.frame_skip
-        self._dt = env.dt
+        self._frames, self._dt = env.frame_skip, env.dt
         self._first = env.init_qpos.copy(), env.init_qvel.copy()
-        self._data = [mujoco.MjData(env.model) for _ in range(count)]
-        # Views into each simulator's own memory, made once.
-        self._controls = [data.ctrl for data in self._data]
-        self._memory = [(data.qpos, data.qvel) for data in self._data]
-        sources = [[view.reshape(-1) for view in self._body.derived(data)] for data in self._data]
-        places, width = env.model.nq, sum(map(len, sources[0])) if count else 0
-        self.states: Floats = np.zeros((count, places + env.model.nv))
+        contacts = self._body.contact_forces
+        self._batch = Batch(env.model, count, min(threads, count), persistent=contacts)
+        self._maker = os.getpid()
+        # A row is a time, positions, velocities and what else a step hangs on, the solver's warm start among it.
+        self._fresh = self._batch.state[0].copy()
+        places, end = env.model.nq, env.model.nq + env.model.nv
+        self.states: Floats = self._batch.state[:, 1 : 1 + end]
         """(n, nq + nv), written in place."""
+        self._controls = self._batch.bind("ctrl")
+        self._sources = self._body.derived(self._batch)
+        if contacts:
+            self._data = mujoco.MjData(env.model)
+            self._forces = np.zeros((count, self._data.cfrc_ext.size))
+            self._sources = [*self._sources, self._forces]
+        width = sum(source.shape[1] for source in self._sources)
         self.now = Snapshot(self.states[:, :places], self.states[:, places:], np.zeros((count, width)))
-        self._copies = [list(_pairs(self.now, i, [*self._memory[i], *sources[i]])) for i in range(count)]
 
     def start(self, i: int, rng: np.random.Generator) -> None:
         """Begin an episode of one of them."""
-        data, (qpos, qvel) = self._data[i], self._memory[i]
         # Also clears the solver's warm start: what an episode does must not hang on the one before it.
-        mujoco.mj_resetData(self._model, data)
-        qpos[:], qvel[:] = self._body.start(*self._first, rng)
-        mujoco.mj_forward(self._model, data)  # what is derived from positions and velocities must follow them
-        self._read(i)
+        self._batch.state[i] = self._fresh
+        self.now.positions[i], self.now.velocities[i] = self._body.start(*self._first, rng)
+        self._batch.forward([i])  # what is derived from positions and velocities must follow them
+        if self._body.contact_forces:
+            self._forces[i] = 0.0
+        self._read()
 
     def skip(self, rng: np.random.Generator) -> None:
         """Draw what the start of an episode draws, for one that is stepped elsewhere."""
         self._body.start(*self._first, rng)
 
-    def advance(self, actions: Floats, which: Iterable[int]) -> tuple[Floats, Bools]:
+    def advance(self, actions: Floats, which: Sequence[int]) -> tuple[Floats, Bools]:
         """One step of those in `which`: (n,) rewards and health. Those of the others mean nothing."""
+        if self._batch.nthread > 1 and os.getpid() != self._maker:
+            raise RuntimeError(
+                "these environments are stepped by threads, which a forked process does not have: make them in the "
+                "process that steps them, or with threads=1"
+            )
         body, now = self._body, self.now
         before = body.place(now).copy()  # a copy: the snapshot is written in place
-        for i in which:
-            data = self._data[i]
-            self._controls[i][:] = actions[i]
-            mujoco.mj_step(self._model, data, nstep=self._frames)
-            if body.contact_forces:
-                mujoco.mj_rnePostConstraint(self._model, data)
-            self._read(i)
+        self._controls[:] = actions
+        self._batch.step(None if len(which) == len(actions) else which, nstep=self._frames)
+        if body.contact_forces:
+            self._add_forces(which)
+        self._read()
         healthy = body.healthy(now)
         return body.reward(now, actions, (body.place(now) - before) / self._dt, healthy), healthy
 
@@ -72,13 +84,20 @@ class Bodies:
         """(n, O) float64, a new array."""
         return self._body.observe(self.now)
 
-    def _read(self, i: int) -> None:
-        for target, source in self._copies[i]:
-            target[:] = source
+    def _add_forces(self, which: Sequence[int]) -> None:
+        for i in which:
+            # A copy of all that a simulator holds: a row has no contacts.
+            self._batch.get_data(i, self._data)
+            mujoco.mj_rnePostConstraint(self._batch.model, self._data)
+            self._forces[i] = self._data.cfrc_ext.reshape(-1)
+
+    def _read(self) -> None:
+        if self._sources:
+            np.concatenate(self._sources, 1, out=self.now.derived)
 
 
 class Simulated:
-    """n bodies of `prefrl.envs.fast.bodies`, stepped one after another; implements `prefrl.protocols.Environments`.
+    """n bodies of `prefrl.envs.fast.bodies`; implements `prefrl.protocols.Environments`.
 
     `make` builds the gymnasium environment whose model and first state are used. With `fixed_horizon` an unhealthy
     body goes on, without its reward for being healthy: what gymnasium does with `terminate_when_unhealthy=False`.
@@ -88,6 +107,8 @@ class Simulated:
 
     With `mine` only those of the n are here, and start as they do among all. That needs a fixed horizon: first states
     are drawn one after another, and what others have drawn is only known where all episodes end at once.
+
+    With `threads` more than 1 so many step them, to the same bits, in the process that made them.
     """
 
     def __init__(
@@ -98,10 +119,11 @@ class Simulated:
         horizon: int,
         fixed_horizon: bool,
         mine: range | None = None,
+        threads: int = 1,
     ) -> None:
         assert mine is None or fixed_horizon
         self._count, self._mine = count, range(count) if mine is None else mine
-        self._bodies = Bodies(name, make().unwrapped, len(self._mine))
+        self._bodies = Bodies(name, make().unwrapped, len(self._mine), threads)
         self._elapsed = np.zeros(len(self._mine), np.int64)
         self._horizon = horizon
         self._terminate = not fixed_horizon
@@ -141,13 +163,3 @@ class Simulated:
 
     def _observe(self) -> Floats:
         return self._bodies.observe().astype(np.float32)
-
-
-def _pairs(now: Snapshot, i: int, sources: list[Floats]) -> Iterator[tuple[Floats, Floats]]:
-    """Where each part of simulator i's memory goes in the snapshot: positions, velocities, then what is derived."""
-    yield now.positions[i], sources[0]
-    yield now.velocities[i], sources[1]
-    begin = 0
-    for source in sources[2:]:
-        yield now.derived[i, begin : begin + len(source)], source
-        begin += len(source)

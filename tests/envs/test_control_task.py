@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -93,3 +95,22 @@ def test_an_environment_without_a_time_limit_needs_a_horizon() -> None:
         assert ControlSettings(env="Still-v0", horizon=10, fps=2.0).build().segment_steps == 3
     finally:
         del gymnasium.registry["Still-v0"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"env": "Pendulum-v1"},
+        {"env": "HalfCheetah-v5", "after_end": "restart"},
+        {"env": "HalfCheetah-v5", "options": {"ctrl_cost_weight": 0.2}},
+        {"env": "HumanoidStandup-v5"},
+    ],
+)
+def test_threads_are_refused_where_no_fast_stepper_of_mujoco_steps(settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"task\.threads=2: only Ant-v5, HalfCheetah-v5, .*leave task\.threads=1"):
+        ControlSettings(threads=2, **settings).build()
+
+
+def test_threads_reach_the_stepper_behind_partial_sight_too() -> None:
+    envs = ControlSettings(env="HalfCheetah-v5", threads=2, hide=(0,)).build().environments(4)
+    assert envs._envs._bodies._batch.nthread == 2  # type: ignore[attr-defined]

@@ -77,9 +77,11 @@ def test_without_autoreset_the_caller_begins_the_episodes_that_have_ended() -> N
 
 
 def test_what_the_fast_stepper_does_not_know_is_refused() -> None:
-    for options in ({"g": 5.0}, {"render_mode": "rgb_array"}, {"terminate_when_unhealthy": False}):
+    for options in ({"g": 5.0}, {"render_mode": "rgb_array"}, {"terminate_when_unhealthy": False}, {"threads": 2}):
         with pytest.raises(ValueError, match=f"Pendulum-v1 has no option '{next(iter(options))}'"):
             gymnasium.make_vec("prefrl/Pendulum-v1", 2, **options)
+    with pytest.raises(ValueError, match="threads must be at least 1, got 0"):
+        gymnasium.make_vec("prefrl/Hopper-v5", 2, threads=0)
     envs = gymnasium.make_vec("prefrl/Pendulum-v1", 2, render_mode=None)
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step(np.zeros((2, 1)))
@@ -98,9 +100,9 @@ def test_what_the_fast_stepper_does_not_know_is_refused() -> None:
         poles.step(np.array([2, 0]))
 
 
-@pytest.mark.parametrize("name", ["Hopper-v5", "CartPole-v1"])
-def test_the_vec_env_is_a_dummy_vec_env(name: str) -> None:
-    ours = FastVecEnv(name, 3, max_episode_steps=40)
+@pytest.mark.parametrize(("name", "options"), [("Hopper-v5", {"threads": 2}), ("CartPole-v1", {})])
+def test_the_vec_env_is_a_dummy_vec_env(name: str, options: dict[str, Any]) -> None:
+    ours = FastVecEnv(name, 3, max_episode_steps=40, **options)
     theirs = DummyVecEnv([lambda: make(name, max_episode_steps=40)] * 3)
     ours.seed(3), theirs.seed(3)
     assert np.array_equal(ours.reset(), theirs.reset())

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
+import os
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mujoco.batch import SimulationError
 
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.fast.bodies import BODIES, _always
 from prefrl.envs.fast.simulated import Simulated
 from prefrl.envs.fast.wrapped import Wrapped, make
 
+TASKS = Path("/proc/self/task")
 
-def _envs(name: str, count: int, horizon: int = 1000, fixed_horizon: bool = True) -> Simulated:
-    return Simulated(name, partial(make, name, disable_env_checker=True), count, horizon, fixed_horizon)
+
+def _envs(name: str, count: int, horizon: int = 1000, fixed_horizon: bool = True, **others: Any) -> Simulated:
+    return Simulated(name, partial(make, name, disable_env_checker=True), count, horizon, fixed_horizon, **others)
 
 
 def _reference(name: str, count: int, fixed_horizon: bool, rng: np.random.Generator) -> list[Any]:
@@ -57,6 +63,53 @@ def test_it_equals_gymnasium_to_the_bit_over_a_thousand_steps_and_their_resets(n
         following = [env.reset()[0] if e else o for env, e, o in zip(reference, ended, observations, strict=True)]
         assert np.array_equal(step.observations, _rows(following))
         assert np.array_equal(ours.states(), np.stack([env.state_vector() for env in reference]))
+
+
+@pytest.mark.parametrize("fixed_horizon", [True, False])
+@pytest.mark.parametrize("name", list(BODIES))
+def test_any_number_of_threads_steps_to_the_same_bits(name: str, fixed_horizon: bool) -> None:
+    one = _envs(name, 5, 25, fixed_horizon)
+    several = [_envs(name, 5, 25, fixed_horizon, threads=threads) for threads in (2, 3, 9)]
+    part = _envs(name, 5, 25, mine=range(1, 4), threads=2) if fixed_horizon else None
+    everyone = [(one, slice(5)), *((envs, slice(5)) for envs in several), *([(part, slice(1, 4))] if part else [])]
+    first = [envs.reset(np.random.default_rng(0)) for envs, _ in everyone]
+    assert all(np.array_equal(found, first[0][rows]) for found, (_, rows) in zip(first, everyone, strict=True))
+    rng, width = np.random.default_rng(1), one._bodies._controls.shape[1]
+    for _ in range(60):  # past two ends of episodes at least
+        actions = rng.uniform(-1, 1, (5, width)).astype(np.float32)
+        steps = [envs.step(actions[rows]) for envs, rows in everyone]
+        for step, (envs, rows) in zip(steps, everyone, strict=True):
+            assert all(np.array_equal(found, wanted[rows]) for found, wanted in zip(step, steps[0], strict=True))
+            assert np.array_equal(envs.states(), one.states()[rows])
+
+
+@pytest.mark.skipif(not TASKS.exists(), reason="counts threads as Linux lists them")
+def test_threads_end_with_the_environments_that_they_step() -> None:
+    before = len(list(TASKS.iterdir()))
+    envs = _envs("HalfCheetah-v5", 4, threads=3)
+    assert len(list(TASKS.iterdir())) == before + 2  # the third is the caller's
+    del envs
+    gc.collect()
+    assert len(list(TASKS.iterdir())) == before
+
+
+def test_a_forked_process_is_told_that_it_has_no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    actions = np.zeros((2, 6), np.float32)
+    single, several = _envs("HalfCheetah-v5", 2), _envs("HalfCheetah-v5", 2, threads=2)
+    for envs in (single, several):
+        envs.reset(np.random.default_rng(0))
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    single.step(actions)
+    with pytest.raises(RuntimeError, match="a forked process does not have"):
+        several.step(actions)
+
+
+def test_an_error_of_a_simulator_reaches_the_caller() -> None:
+    envs = _envs("HalfCheetah-v5", 4, threads=2)
+    envs.reset(np.random.default_rng(0))
+    envs._bodies._batch.expand("opt.integrator")[3] = 99
+    with pytest.raises(SimulationError, match=r"in 1 of 4 simulations \(3\); simulation 3: .*integrator"):
+        envs.step(np.zeros((4, 6), np.float32))
 
 
 @pytest.mark.parametrize("name", [name for name, body in BODIES.items() if body.healthy is not _always])
