@@ -1,6 +1,7 @@
 """PPO on a simulator's own reward: prefrl's learner for control against stable-baselines3's, at equal settings.
 
     python benchmarks/control_ppo.py [--env HalfCheetah-v5] [--windows 5] [--short]
+    python benchmarks/control_ppo.py --threads 2
     python benchmarks/control_ppo.py --env HalfCheetah-v5 --returns --steps 1000000 --seeds 5 [--out runs/control-ppo]
 
 Both have 16 environments, rollouts of 256 steps in each, minibatches of 256, 10 epochs, two layers of 64 units, and the
@@ -8,10 +9,14 @@ same learning rate, clip, discount and trace; stable-baselines3 steps with Dummy
 normalises observations and rewards (VecNormalize). Ours normalises observations itself, and is given the true reward
 over its std so far: not shifted, since episodes end where gymnasium ends them, for both.
 
-The first command measures speed: windows of learning take turns in one process, with one thread; what acting, stepping
+The first command measures cost: windows of learning take turns in one process, with one thread; what acting, stepping
 and updating cost together is compared in CPU seconds. `ratio` is peer / ours: above 1, prefrl needs fewer.
 
-The second measures what is learned: after so many steps 20 episodes of the policy's mode are scored by the true reward.
+The second measures seconds on the clock, where either side may use so many cores: prefrl steps on so many threads
+(`task.threads`), and either side computes with one thread of torch or with so many; stable-baselines3 steps with
+DummyVecEnv or with SubprocVecEnv, a process for each environment. What is quickest for each is compared.
+
+The third measures what is learned: after so many steps 20 episodes of the policy's mode are scored by the true reward.
 The seeds' interquartile mean with a 95 % bootstrap interval; runs are kept in OUT and taken up where they are there.
 The last line is one JSON object.
 """
@@ -20,21 +25,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
 import torch
 from scipy.stats import bootstrap, trim_mean
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from prefrl.envs.control import ControlSettings
+from prefrl.envs.fast.wrapped import make
 from prefrl.improve import control
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.policies.rollout import Rollout, whole_episodes
@@ -61,7 +68,7 @@ class TrueReward:
 
 
 class Ours:
-    def __init__(self, env: str, seed: int, steer: bool, fresh: bool = False) -> None:
+    def __init__(self, env: str, seed: int, steer: bool, fresh: bool = False, threads: int = 1) -> None:
         settings = ControlLearnerSettings(
             fresh_starts=fresh,
             environments=ENVIRONMENTS,
@@ -74,7 +81,7 @@ class Ours:
             critic_epochs=0,
             entropy=0.0,
         )
-        self._task = ControlSettings(env=env, variable_horizon=True).build()
+        self._task = ControlSettings(env=env, variable_horizon=True, threads=threads).build()
         self._learner, self._rng = settings.build(self._task, np.random.default_rng(seed)), np.random.default_rng(seed)
         self._reward = TrueReward()
 
@@ -94,9 +101,10 @@ class Ours:
 
 
 class Peer:
-    def __init__(self, env: str, seed: int) -> None:
+    def __init__(self, env: str, seed: int, processes: bool = False) -> None:
         self._env = env
-        self._envs = VecNormalize(DummyVecEnv([lambda: gymnasium.make(env) for _ in range(ENVIRONMENTS)]))
+        stepper = SubprocVecEnv if processes else DummyVecEnv
+        self._envs = VecNormalize(stepper([lambda: make(env) for _ in range(ENVIRONMENTS)]))
         self._envs.seed(seed)
         self._model = PPO(
             "MlpPolicy",
@@ -114,7 +122,7 @@ class Peer:
         self._model.learn(batches * BATCH, reset_num_timesteps=False)
 
     def gold(self) -> float:
-        single = VecNormalize(DummyVecEnv([lambda: gymnasium.make(self._env)]), training=False, norm_reward=False)
+        single = VecNormalize(DummyVecEnv([lambda: make(self._env)]), training=False, norm_reward=False)
         single.obs_rms = self._envs.obs_rms
         single.seed(9)
         return float(cast(float, evaluate_policy(self._model, single, EPISODES)[0]))
@@ -124,6 +132,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--windows", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1, help="more than 1: seconds on the clock with so many cores")
     parser.add_argument("--returns", action="store_true", help="what is learned, in place of how fast")
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--seeds", type=int, default=5)
@@ -134,7 +143,7 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="a window a side")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    measure = returns if options.returns else speed
+    measure = returns if options.returns else clock if options.threads > 1 else speed
     print(json.dumps(measure(options) | {"short": options.short}))
 
 
@@ -159,10 +168,53 @@ def speed(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def timed(call: Callable[[], None]) -> float:
-    start = time.process_time()
+@dataclass(frozen=True)
+class Way:
+    """One way of a side to use several cores."""
+
+    side: Ours | Peer
+    torch_threads: int
+
+    def seconds(self) -> float:
+        torch.set_num_threads(self.torch_threads)
+        return timed(lambda: self.side.learn(2), time.perf_counter)
+
+
+def clock(options: argparse.Namespace) -> dict[str, Any]:
+    """Every way has its turn in each window; the best of either side are compared window by window."""
+    env, threads = options.env, options.threads
+    ours, dummy, processes = Ours(env, 0, steer=False, threads=threads), Peer(env, 0), Peer(env, 0, processes=True)
+    ways = {
+        f"{name}, {computing} of torch": Way(side, computing)
+        for name, side in {"ours": ours, "peer": dummy, "peer in processes": processes}.items()
+        for computing in (1, threads)
+    }
+    for way in ways.values():
+        way.seconds()  # not counted: what is only done once
+    found: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(1 if options.short else options.windows):
+        for name in ways if number % 2 == 0 else reversed(ways):
+            found[name].append(ways[name].seconds() / (2 * BATCH) * 1e6)
+    middle = {name: round(statistics.median(values), 1) for name, values in found.items()}
+    best, peer = (min((n for n in ways if n.startswith(side)), key=middle.__getitem__) for side in ("ours", "peer"))
+    ratios = [theirs / own for own, theirs in zip(found[best], found[peer], strict=True)]
+    return {
+        "name": f"control_ppo: {env}, PPO with {ENVIRONMENTS} environments, {threads} threads",
+        "unit": "us on the clock an environment step",
+        "ours": middle[best],
+        "peer": middle[peer],
+        "ratio": round(statistics.median(ratios), 2),
+        "spread": [round(min(ratios), 2), round(max(ratios), 2)],
+        "ways": middle,
+        "load": round(os.getloadavg()[0], 1),
+        "equal_work": True,
+    }
+
+
+def timed(call: Callable[[], None], seconds: Callable[[], float] = time.process_time) -> float:
+    start = seconds()
     call()
-    return time.process_time() - start
+    return seconds() - start
 
 
 def returns(options: argparse.Namespace) -> dict[str, Any]:
