@@ -114,3 +114,8 @@ def test_threads_are_refused_where_no_fast_stepper_of_mujoco_steps(settings: dic
 def test_threads_reach_the_stepper_behind_partial_sight_too() -> None:
     envs = ControlSettings(env="HalfCheetah-v5", threads=2, hide=(0,)).build().environments(4)
     assert envs._envs._bodies._batch.nthread == 2  # type: ignore[attr-defined]
+
+
+def test_a_run_may_go_on_with_another_number_of_threads() -> None:
+    several = ControlSettings(env="HalfCheetah-v5", threads=2)
+    assert several.lasting() == several.identity() == ControlSettings(env="HalfCheetah-v5")
