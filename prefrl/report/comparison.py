@@ -105,7 +105,7 @@ def _numbers(found: Sequence[Contest], others: Sequence[str]) -> str:
         {
             "task": contest.task,
             "name": group.name,
-            "command": _command(group),
+            **_asked(group),
             "score": "gold" if contest.by_gold else "wins against the start",
             "interquartile_mean": group.score.value,
             "interval": [group.score.low, group.score.high],
@@ -135,16 +135,17 @@ def _run(run: Seen, by_gold: bool) -> Json:
     }
 
 
-def _command(group: Group) -> str | None:
-    """Makes the group again; None where it is not known from what its runs were made."""
+def _asked(group: Group) -> Json:
+    """What makes the group again: preset or file, settings, and the command; None where the runs do not say it."""
     known = [run.facts for run in group.runs if run.facts.source]
     if not known:
-        return None
+        return {"source": None, "overrides": [], "command": None}
+    source, overrides = known[0].source, [one for one in known[0].overrides if not one.startswith("seed=")]
     seeds = [run.seed for run in group.runs]
     several = ["--seeds", str(len(seeds))] if len(seeds) > 1 and _in_a_row(seeds) else []
-    first = seeds[0] if several or len(seeds) == 1 else "SEED"
-    kept = [one for one in known[0].overrides if not one.startswith("seed=")]
-    return shlex.join(["prefrl", "run", known[0].source, *several, *kept, f"seed={first}"])
+    first = f"seed={seeds[0] if several or len(seeds) == 1 else 'SEED'}"
+    command = shlex.join(["prefrl", "run", source, *several, *overrides, first])
+    return {"source": source, "overrides": overrides, "command": command}
 
 
 def _distinct(values: Iterable[Json]) -> list[Json]:
