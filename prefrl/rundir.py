@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,8 @@ from prefrl.evaluate.drift import first_judged, read_probes
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
 from prefrl.evaluate.hindsight import hindsight, keep, keep_in, read_from
-from prefrl.evaluate.summary import read_metrics, summarise
+from prefrl.evaluate.provenance import made_with
+from prefrl.evaluate.summary import Origin, read_metrics, read_summary, summarise
 from prefrl.loop import Loop
 from prefrl.protocols import Attended, Noted, RewardModel, Task
 from prefrl.ranks import lead, rounds, shared
@@ -50,10 +51,17 @@ class Run:
     A folder with the same settings is taken up where it stopped; one with other settings is refused.
     """
 
-    def __init__(self, config: Config, folder: str | Path, reward: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        folder: str | Path,
+        reward: Path | None = None,
+        asked: tuple[str, Sequence[str]] | None = None,
+    ) -> None:
         """Make or reopen the folder and build everything in it.
 
         `reward`: start from the reward model saved there; the run keeps a copy, and always starts from that one.
+        `asked`: the preset or file that the settings come from, and the overrides; the summary says them.
         """
         self.config, self.folder = config, Path(folder)
         self.notes: list[str] = []
@@ -67,6 +75,7 @@ class Run:
                 self.notes += self.loop.task.notes
             self._start_from(reward)
             self._rows = self._restore()
+            self._origin = self._found_origin(asked)
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
             self._trackers = Trackers(self.folder, config.model_dump(mode="json"), config.track, self.loop.round)
             opened.callback(self._trackers.close)
@@ -116,7 +125,7 @@ class Run:
     @property
     def summary(self) -> Json:
         """What came out, as in `summary.json`."""
-        return summarise(self._rows, self.loop.task, self.config.seed)
+        return summarise(self._rows, self.loop.task, self.config.seed, self._origin)
 
     def report(self) -> Path:
         """Grade the reward model where judgements were held out, score all rounds by it, and write `report.html`."""
@@ -159,6 +168,14 @@ class Run:
         if kept.exists():
             verify(kept)
             self.loop.reward.load(load_state(kept, "reward"))
+
+    def _found_origin(self, asked: tuple[str, Sequence[str]] | None) -> Origin:
+        """Where the numbers come from: those of finished rounds, from the processes that made them."""
+        source, overrides = asked or (None, ())
+        if source is not None and Path(source).exists():
+            source = Path(source).name  # where it lies is nobody's business
+        now = Origin(source, overrides, [made_with(self.loop.threads)])
+        return now.after(read_summary(self.folder)) if self._rows else now
 
     def _record(self, round: Round) -> None:
         """Put a finished round on disk. The checkpoint comes last: it says that the rest is there."""

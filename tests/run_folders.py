@@ -41,7 +41,10 @@ def folder_of_run(
         "labels": {"asked": 40, "answered": 40, "skipped": 0},
         "steps": {"learn": 1000, "query": 100, "evaluate": 50},
         "seconds": {"sample": 1.0, "total": 2.0},
+        "source": "control/pendulum",
+        "overrides": ["loop.pool=3", f"seed={settings['seed']}"],
         "versions": {"prefrl": "0.1"},
+        "made_with": [{"commit": "c0ffee", "changed": False, "versions": {"prefrl": "0.1"}}],
     }
     (folder / "summary.json").write_text(json.dumps(summary))
     return folder

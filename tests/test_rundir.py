@@ -20,6 +20,7 @@ TOYS = ["control/toy", "text/toy"]
 SUMMARY = {
     "task", "kind", "seed", "rounds", "gold_before", "gold_after", "gold_best", "labels", "steps", "reward_accuracy",
     "kl", "fluency_before", "fluency_after", "seconds", "versions",
+    "source", "overrides", "made_with",
 }  # fmt: skip
 
 
@@ -61,12 +62,15 @@ def test_a_run_leaves_the_files_that_the_design_names(
 def test_a_run_stopped_between_rounds_ends_in_the_same_bytes(
     name: str, finished_tiny: dict[str, Path], tmp_path: Path
 ) -> None:
-    with Run(tiny(name), tmp_path / "parts") as run:
+    with Run(tiny(name), tmp_path / "parts", asked=(name, ["loop.rounds=2"])) as run:
         rounds = iter(run)
         next(rounds), next(rounds)
     with Run.resume(tmp_path / "parts") as run:
         assert run.notes == ["going on after round 1"]
         assert [r.number for r in run] == list(range(2, run.config.loop.rounds + 1))
+    summary = json.loads((tmp_path / "parts/summary.json").read_text())
+    assert (summary["source"], summary["overrides"]) == (name, ["loop.rounds=2"])
+    assert len(summary["made_with"]) == 1  # two processes with the same code on the same machine
     assert weights(tmp_path / "parts") == weights(finished_tiny[name])
     assert numbers(tmp_path / "parts") == numbers(finished_tiny[name])
     assert (tmp_path / "parts/probes.jsonl").read_bytes() == (finished_tiny[name] / "probes.jsonl").read_bytes()

@@ -100,7 +100,7 @@ def run(
             out = _new_folder(source)
             say(f"the run's folder: {out}")
         if here and out is not None:
-            drive(Run(config, out))
+            drive(Run(config, out, asked=(source, overrides)))
 
 
 @app.command()

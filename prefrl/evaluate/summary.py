@@ -3,15 +3,43 @@
 from __future__ import annotations
 
 import json
-import platform
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from prefrl.protocols import Task
 from prefrl.types import Json
 
-PACKAGES = ("prefrl", "torch", "numpy", "transformers", "gymnasium", "mujoco", "stable-baselines3")
 STAGES = ("sample", "label", "fit", "improve", "evaluate")
+
+
+class Origin(NamedTuple):
+    """What was asked for, and what computed it."""
+
+    source: str | None
+    """A preset, or the name of a file of settings; None where a program made the settings."""
+    overrides: Sequence[str]
+    """As `dotted.key=value`."""
+    made_with: Sequence[Json]
+    """Of each process that had a part in the run, in their order; those that computed with the same are one."""
+
+    def after(self, earlier: Json) -> Origin:
+        """That of a run which another process began, by the summary that it left."""
+        there = earlier.get("made_with") or [{"versions": earlier.get("versions", {})}]
+        made = [*there, *(one for one in self.made_with if one != there[-1])]
+        if self.source is None:
+            return Origin(earlier.get("source"), earlier.get("overrides", ()), made)
+        return self._replace(made_with=made)
+
+
+def read_summary(folder: Path) -> Json:
+    """What a run left in `summary.json` so far; empty where it left none that can be read."""
+    path = folder / "summary.json"
+    try:
+        found = json.loads(path.read_text()) if path.exists() else {}
+    except ValueError:
+        found = {}
+    return found if isinstance(found, dict) else {}
 
 
 def read_metrics(folder: Path) -> list[Json]:
@@ -20,7 +48,7 @@ def read_metrics(folder: Path) -> list[Json]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def summarise(rows: list[Json], task: Task, seed: int) -> Json:
+def summarise(rows: list[Json], task: Task, seed: int, origin: Origin) -> Json:
     """One flat account of a run from its metrics; None where something was not measured."""
     first, last = (rows[0], rows[-1]) if rows else ({}, {})
     gold = [row["evaluate/gold"] for row in rows if row.get("evaluate/gold") is not None]
@@ -41,15 +69,8 @@ def summarise(rows: list[Json], task: Task, seed: int) -> Json:
         "fluency_before": first.get("evaluate/fluency"),
         "fluency_after": last.get("evaluate/fluency"),
         "seconds": seconds | {"total": sum(seconds.values())},
-        "versions": _versions(),
+        "source": origin.source,
+        "overrides": list(origin.overrides),
+        "versions": origin.made_with[-1]["versions"],
+        "made_with": list(origin.made_with),
     }
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

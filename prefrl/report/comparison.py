@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import cycle, islice
 from pathlib import Path
@@ -104,18 +105,51 @@ def _numbers(found: Sequence[Contest], others: Sequence[str]) -> str:
         {
             "task": contest.task,
             "name": group.name,
+            **_asked(group),
             "score": "gold" if contest.by_gold else "wins against the start",
             "interquartile_mean": group.score.value,
             "interval": [group.score.low, group.score.high],
-            "runs": [
-                {"folder": str(run.folder), "seed": run.facts.seed, "score": ended(run.facts, contest.by_gold)}
-                for run in group.runs
-            ],
+            "runs": [_run(run, contest.by_gold) for run in group.runs],
+            "settings": group.runs[0].settings,
+            "made_with": _distinct(made for run in group.runs for made in run.facts.made_with),
         }
         for contest in found
         for group in contest.groups
     ]
     return json.dumps({"groups": groups, "left_out": list(others)}, indent=1)
+
+
+def _run(run: Seen, by_gold: bool) -> Json:
+    facts = run.facts
+    return {
+        "folder": str(run.folder),
+        "seed": facts.seed,
+        "score": ended(facts, by_gold),
+        "gold": facts.gold[:2],
+        "kl": facts.kl,
+        "fluency": facts.fluency,
+        "reward_accuracy": facts.reward_accuracy,
+        "labels": facts.labels["answered"],
+        "steps": dict(facts.steps),
+        "seconds": facts.total_seconds,
+    }
+
+
+def _asked(group: Group) -> Json:
+    """What makes the group again: preset or file, settings, and the command; None where the runs do not say it."""
+    known = [run.facts for run in group.runs if run.facts.source]
+    if not known:
+        return {"source": None, "overrides": [], "command": None}
+    source, overrides = known[0].source, [one for one in known[0].overrides if not one.startswith("seed=")]
+    seeds = [run.seed for run in group.runs]
+    several = ["--seeds", str(len(seeds))] if len(seeds) > 1 and _in_a_row(seeds) else []
+    first = f"seed={seeds[0] if several or len(seeds) == 1 else 'SEED'}"
+    command = shlex.join(["prefrl", "run", source, *several, *overrides, first])
+    return {"source": source, "overrides": overrides, "command": command}
+
+
+def _distinct(values: Iterable[Json]) -> list[Json]:
+    return list({json.dumps(value, sort_keys=True): value for value in values}.values())
 
 
 def rows_of(contest: Contest) -> list[Row]:
@@ -259,8 +293,11 @@ def _profiles(contest: Contest, styles: Sequence[tuple[str, str]], name: str) ->
 
 def _seeds(contest: Contest) -> str:
     seeds = sorted({run.facts.seed for group in contest.groups for run in group.runs if run.facts.seed is not None})
-    together = len(seeds) > 2 and seeds == list(range(seeds[0], seeds[-1] + 1))
-    return f"{seeds[0]} to {seeds[-1]}" if together else ", ".join(map(str, seeds))
+    return f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 2 and _in_a_row(seeds) else ", ".join(map(str, seeds))
+
+
+def _in_a_row(seeds: Sequence[int]) -> bool:
+    return list(seeds) == list(range(seeds[0], seeds[0] + len(seeds)))
 
 
 def _versions(contest: Contest) -> str:

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 from prefrl.evaluate.summary import STAGES
 from prefrl.kinds import RESPONSES, SEGMENTS, Kind, find
-from prefrl.report.records import Record, mapping, number, visible, whole
+from prefrl.report.records import Record, listed, mapping, number, visible, whole
 from prefrl.stats.estimates import Estimate
+from prefrl.types import Json
 
 FARTHER, MUCH_FARTHER = 0.5, 1.25
 """Nats more, and how many times as many, that are not to be had for nothing."""
@@ -55,6 +56,11 @@ class Facts:
     """By stage; only stages that were timed."""
     total_seconds: float | None
     versions: Mapping[str, str]
+    source: str
+    """The preset, or the name of the file of settings; empty where it is not known."""
+    overrides: tuple[str, ...]
+    made_with: tuple[Json, ...]
+    """What the processes that had a part in it computed with: commit, processor, threads, versions."""
 
     @property
     def words(self) -> Kind[Any]:
@@ -106,6 +112,9 @@ def gather(record: Record) -> Facts:
         seconds=seconds,
         total_seconds=number(mapping(summary.get("seconds")).get("total")) or sum(seconds.values()) or None,
         versions={visible(k, 100): visible(v, 200) for k, v in mapping(summary.get("versions")).items()},
+        source=visible(summary.get("source"), 200),
+        overrides=tuple(visible(one, 200) for one in listed(summary.get("overrides"))),
+        made_with=tuple(mapping(one) for one in listed(summary.get("made_with"))),
     )
 
 

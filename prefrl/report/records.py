@@ -142,6 +142,10 @@ def mapping(value: object) -> Json:
     return {visible(k): v for k, v in value.items() if isinstance(k, str)} if isinstance(value, dict) else {}
 
 
+def listed(value: object) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
 def visible(value: object, limit: int = MAX_TEXT) -> str:
     """A text in which control and direction characters are spelled out, cut (and saying so) beyond `limit`."""
     if value is None:

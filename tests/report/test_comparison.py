@@ -104,8 +104,25 @@ def test_a_page_a_table_and_numbers_are_written_by_the_files_name(two_rates: Pat
     numbers = json.loads((tmp_path / "n.json").read_text())
     assert numbers["groups"][1]["interquartile_mean"] == pytest.approx(-7.5)
     assert [run["seed"] for run in numbers["groups"][0]["runs"]] == [0, 1, 2, 3]
+    assert numbers["groups"][0]["command"] == "prefrl run control/pendulum --seeds 4 loop.pool=3 seed=0"
+    assert numbers["groups"][0]["settings"]["learner.learning_rate"] == 0.5
+    assert [made["commit"] for made in numbers["groups"][0]["made_with"]] == ["c0ffee"]
     with pytest.raises(ValueError, match="ends in"):
         write_comparison([two_rates], tmp_path / "table.txt")
+
+
+def test_seeds_that_do_not_follow_one_another_and_runs_of_unknown_making_have_no_single_command(tmp_path: Path) -> None:
+    for seed in (0, 2):
+        folder_of_run(tmp_path / "runs" / f"{seed}", [0.0, 1.0], settings(seed))
+    write_comparison([tmp_path / "runs"], tmp_path / "n.json")
+    (group,) = json.loads((tmp_path / "n.json").read_text())["groups"]
+    assert group["command"] == "prefrl run control/pendulum loop.pool=3 seed=SEED"
+    for path in tmp_path.glob("runs/*/summary.json"):
+        old = json.loads(path.read_text())
+        path.write_text(json.dumps({k: v for k, v in old.items() if k not in ("source", "overrides", "made_with")}))
+    write_comparison([tmp_path / "runs"], tmp_path / "n.json")
+    (group,) = json.loads((tmp_path / "n.json").read_text())["groups"]
+    assert (group["source"], group["command"], group["made_with"]) == (None, None, [])
 
 
 def test_what_a_folder_is_called_is_no_markup(tmp_path: Path) -> None:
