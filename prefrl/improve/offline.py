@@ -21,7 +21,9 @@ from prefrl.components import Settings
 from prefrl.exchange.recordings import recording
 from prefrl.fit.pairs import Batch, batch
 from prefrl.fit.split import split
-from prefrl.improve.gradient import adam_of, descend_by_logp
+from prefrl.improve import gradient
+from prefrl.improve.gradient import adam_of, descend_by_logp, update
+from prefrl.improve.objectives import Objective
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import Player
 from prefrl.kinds import kind_of
@@ -131,7 +133,7 @@ class Offline:
         self._settings, self._task, self._improve = settings, task, improve
         self._discount, self._alpha = discount, alpha
         network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
-        self.policy = MLPPolicy(network, task, rng, learns_std)
+        self.policy, self._learns_std = MLPPolicy(network, task, rng, learns_std), learns_std
         self.policy.to(device_of(settings.device))
         self.optimizer = adam_of(self.policy, settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
@@ -156,7 +158,8 @@ class Offline:
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Clone in the first round, and learn by the method. Metrics: the method's, and cloning_loss where it cloned
-        (mean of the squared distance to a recorded action over twice its variance, or of -log pi, in the last pass).
+        (mean over the last pass of the squared distance to a recorded action over twice its variance; of -log pi where
+        actions are discrete or the std is learned).
 
         Raises ValueError where there is nothing to learn from.
         """
@@ -165,14 +168,16 @@ class Offline:
         held = batch([one for one, left in zip(judged, out, strict=True) if left])
         kept = batch([one for one, left in zip(judged, out, strict=True) if not left])
         apart = {one.id for one in held.candidates}
-        shown = [one.like for one in store.demonstrations()] if store is not None else []
+        demonstrations = store.demonstrations() if store is not None else []
+        shown = [one.like for one in demonstrations]
         # What came first stands first: the normaliser sees what is new at the end.
         known = (*self._data, *shown) if self._settings.imitates else (*kept.candidates, *shown, *self._data)
         every = {one.id: one for one in known if one.id not in apart}
         if not every:
             raise ValueError(_nothing(self._settings))
         material = Material(kept, tuple(every.values()))
-        metrics = self._clone(material.segments, rng) | self._improve(self, material, reward, rng)
+        weights = {one.like.id: one.demonstration.weight for one in demonstrations}
+        metrics = self._clone(material.segments, weights, rng) | self._improve(self, material, reward, rng)
         self._player.rounds += 1
         self._measured = self._agreement(held) if len(held) else {}
         return metrics
@@ -214,18 +219,27 @@ class Offline:
         self._measured, self._seen = state["measured"], state.get("seen", 0)  # runs from before it was counted
         self._player.load(state)
 
-    def _clone(self, segments: Sequence[Segment], rng: np.random.Generator) -> Metrics:
+    def _clone(self, segments: Sequence[Segment], weights: dict[str, float], rng: np.random.Generator) -> Metrics:
+        """Raise the log-probability of every step, which is the policy gradient with an advantage of 1, or of the
+        weight of its demonstration."""
         if self.policy.normaliser.count and not self._settings.imitates:
             return {}
         if new := segments[self._seen :]:
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
-        steps, settings = Recordings.of(segments, self.policy).decisions, self._settings
+        settings, recordings = self._settings, Recordings.of(segments, self.policy)
+        each = np.repeat([weights.get(one.id, 1.0) for one in segments], recordings.lengths)
+        advantages = torch.from_numpy(each.astype(np.float32)[:, None]).to(self.policy.device)
+        steps = gradient.Batch(recordings.decisions, torch.zeros_like(advantages), advantages)
+        objective = Objective(clip=None, value=0.0, entropy=0.0, max_grad_norm=settings.max_grad_norm)
         found: list[Metrics] = []
         for _ in range(settings.cloning_epochs):
-            parts = shuffled(len(steps.choices), settings.cloning_minibatch, rng)
-            found = [self.descend(steps, rows, self._surprise) for rows in parts]
-        return {"cloning_loss": float(np.mean([one["loss"] for one in found]))} if found else {}
+            parts = shuffled(len(each), settings.cloning_minibatch, rng)
+            rows = (torch.from_numpy(at).to(self.policy.device) for at in parts)
+            found = update(self.policy, self.optimizer, steps, rows, objective)
+        # Of a std that stays, a density says nothing: against the mode's it is a distance.
+        beside = 0.0 if self._learns_std else self.policy.peak * float(each.mean())
+        return {"cloning_loss": float(np.mean([one["loss"] for one in found])) + beside} if found else {}
 
     def descend(
         self, steps: Decisions, rows: Integers, loss_of: Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]]
@@ -233,9 +247,6 @@ class Offline:
         """One gradient step of the policy on a loss of the log-probabilities (b, 1) of some steps."""
         some = steps.rows(torch.from_numpy(rows).to(self.policy.device))
         return descend_by_logp(self.policy, self.optimizer, some, loss_of, self._settings.max_grad_norm)
-
-    def _surprise(self, logp: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        return (self.policy.peak - logp).mean(), {}
 
     @torch.no_grad()
     def _agreement(self, held: Batch[Segment]) -> Metrics:

@@ -65,20 +65,31 @@ def test_a_clone_does_what_was_shown(tmp_path: Path, discrete: bool, advice: Adv
     assert gold(one) > before
 
 
-def test_the_gradient_is_that_of_the_likelihood_of_every_step() -> None:
-    task = point()
-    one = learner(task, max_grad_norm=1e9)
-    seen = np.random.default_rng(0).uniform(-1, 1, (2, 6, 1)).astype(np.float32)
-    segments = [Segment(rows, to_the_middle(rows), f"e{i}", 0) for i, rows in enumerate(seen)]
-    one.policy.observe(np.concatenate([s.observations for s in segments]))
-    steps = Recordings.of(segments, one.policy).decisions
-    one.descend(steps, np.arange(12), one._surprise)
-    (own,) = one.policy.parameters()
-    again = learner(task)
-    again.policy.observe(np.concatenate([s.observations for s in segments]))
-    (weights,) = again.policy.parameters()
-    (by_torch,) = torch.autograd.grad(-again.policy.log_prob(steps)[0].mean(), weights)
+def test_a_pass_is_a_step_down_the_negative_log_likelihood_weighted_as_was_said(tmp_path: Path) -> None:
+    """Against automatic differentiation; Adam's first step goes by the rate along the sign of the gradient."""
+    task, rng = point(), np.random.default_rng(0)
+    shown = [Segment(seen, to_the_middle(seen), f"e{i}", 0) for i, seen in enumerate(_seen(rng, 2, 6))]
+    one = learner(task, max_grad_norm=1e9, cloning_epochs=1, cloning_minibatch=12)
+    with Store[Segment](tmp_path) as store:
+        queries = [Query((segment,)) for segment in shown]
+        store.ask(queries)
+        weights = (1.0, 3.0)
+        store.answer([Demonstration(q.id, s.id, weight=w) for q, s, w in zip(queries, shown, weights, strict=True)])
+        metrics = one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+        again = learner(task)
+        again.policy.observe(np.concatenate([segment.observations for segment in shown]))
+    steps = Recordings.of(shown, again.policy).decisions
+    (own,), (parameter,) = one.policy.parameters(), again.policy.parameters()
+    each = torch.tensor(weights).repeat_interleave(6)[:, None]
+    loss = -(each * again.policy.log_prob(steps)[0]).mean()
+    (by_torch,) = torch.autograd.grad(loss, parameter)
     torch.testing.assert_close(own.grad, by_torch, rtol=1e-5, atol=1e-6)
+    assert metrics["cloning_loss"] == pytest.approx(float(loss.detach()) + 2.0 * again.policy.peak, rel=1e-4)
+
+
+def _seen(rng: np.random.Generator, count: int, steps: int) -> Floats:
+    found: Floats = rng.uniform(-1, 1, (count, steps, 1)).astype(np.float32)
+    return found
 
 
 def test_corrections_in_its_own_states_are_learned_with_what_was_shown(tmp_path: Path) -> None:
