@@ -28,6 +28,7 @@ TRAINING = {
     "Clipped": ("improve/clipped", "The share of steps whose probability ratio left the clip's range."),
     "Critic": ("improve/explained", "The share of the returns' variance that the critic foresees: 1 is all, 0 none."),
     "Loss": ("improve/loss", "What the gradient steps minimise: it need not fall for the policy to get better."),
+    "Cloning": ("improve/cloning_loss", "How far it is from what was shown, in nats a step: it falls as it follows."),
     "Learning rate": ("improve/learning_rate", "At the end of each round's updates, or on average."),
     "Length": ("evaluate/length", "Of what the policy does, on average: a reward that pays for length shows here."),
 }

@@ -50,6 +50,8 @@ class Facts:
     reward_accuracy: float | None
     kl: float | None
     drifted: Drifted | None
+    shown: int | None
+    """Demonstrations that the policy learned from, where nothing was fitted beside; None where it learned otherwise."""
     labels: Mapping[str, int | None]
     steps: Mapping[str, int | None]
     seconds: Mapping[str, float]
@@ -107,6 +109,7 @@ def gather(record: Record) -> Facts:
         reward_accuracy=first("reward_accuracy", last("fit/accuracy_held_out")),
         kl=first("kl", last("evaluate/kl")),
         drifted=_drifted(record),
+        shown=None if _has_fitted(record) else whole(last("improve/demonstrations")),
         labels=total("labels", ("asked", "answered", "skipped"), "label"),
         steps=total("steps", ("learn", "query", "evaluate"), "steps"),
         seconds=seconds,
@@ -125,8 +128,11 @@ def _won(record: Record) -> Estimate | None:
 
 def _fixed(record: Record) -> bool:
     """No round has fitted, and yet a reward had something to say."""
-    fitted = any(value is not None for value in record.series("fit/loss"))
-    return not fitted and any(value is not None for value in record.series("evaluate/learned"))
+    return not _has_fitted(record) and any(value is not None for value in record.series("evaluate/learned"))
+
+
+def _has_fitted(record: Record) -> bool:
+    return any(value is not None for value in record.series("fit/loss"))
 
 
 def _drifted(record: Record) -> Drifted | None:

@@ -72,6 +72,8 @@ def verdict(facts: Facts) -> str:
             remarks.append(f"The change is {noise}.")
         if best is not None and best > max(after, before) and best - after > 0.1 * (best - before):
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
+    if facts.shown is not None:
+        remarks.append(f"It learned from {show_count(facts.shown, 'demonstration')}; nothing was compared.")
     remarks += _wins(facts)
     if facts.drifted is not None:
         since, near, far = facts.drifted
