@@ -18,6 +18,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -156,13 +157,20 @@ class Turns:
         self.tell()
         self.wait()
 
+    def after(self, step: Callable[[Any], None]) -> Callable[[Any], None]:
+        def stepped(optimizer: Any) -> None:
+            step(optimizer)
+            self.over()
+
+        return stepped
+
 
 def ours(folder: Path, precision: Any) -> None:
     import numpy as np
     import torch
-    from torch.optim.optimizer import register_optimizer_step_post_hook
     from transformers import AutoTokenizer
 
+    from prefrl.fit.adam import Adam
     from prefrl.fit.settings import FittingSettings
     from prefrl.fit.trainer import fit
     from prefrl.judgements import Comparison
@@ -181,7 +189,7 @@ def ours(folder: Path, precision: Any) -> None:
         queries = [(Query(pair), pair[0]) for pair in train]
         store.ask([query for query, _ in queries])
         store.answer([Comparison(query.id, float(query.candidates[0] is better), "rule") for query, better in queries])
-        register_optimizer_step_post_hook(turns.over)
+        Adam.step = turns.after(Adam.step)  # type: ignore[method-assign]
         turns.wait()
         fit(reward, store, fitting, np.random.default_rng(0))
     spent = time.process_time() - turns.begin

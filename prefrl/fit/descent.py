@@ -14,6 +14,7 @@ from torch import Tensor
 
 from prefrl.distributed import world
 from prefrl.fit import semi
+from prefrl.fit.adam import Adam
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
 from prefrl.fit.losses import weighted_mean
 from prefrl.fit.noise import Discriminator, flipped
@@ -114,7 +115,7 @@ class _Descent(Generic[C]):
             {"params": problem.likelihood.parameters(), "lr": RATE, "weight_decay": 0.0},
         ]
         groups = [group for group in groups if group["params"]]
-        self.optimizer = torch.optim.AdamW(groups, self.fitting.learning_rate, fused=True)
+        self.optimizer = Adam(groups, self.fitting.learning_rate)
         self.order = generator(rng)
         self.discriminator = Discriminator()
 

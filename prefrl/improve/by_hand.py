@@ -12,49 +12,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from prefrl.improve.objectives import MAX_LOG_RATIO, Objective
 from prefrl.protocols import ByHand
-from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Metrics
-
-
-class Adam(torch.optim.Adam):
-    """torch's Adam of a single tensor, in NumPy: the same state, and the same numbers to rounding.
-
-    torch's own spends most of its time on what surrounds the arithmetic.
-    """
-
-    def step(self, closure: Any = None) -> None:  # type: ignore[override]
-        """Raises ValueError for anything but one tensor on the CPU, whose gradient is known."""
-        (group,) = self.param_groups
-        (parameter,) = group["params"]
-        if parameter.grad is None or not parameter.is_cpu or closure is not None:
-            raise ValueError("expected a tensor on the CPU that has a gradient, and no closure")
-        state = self.state[parameter]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        state["step"] += 1
-        count, (slow, slower) = float(state["step"]), group["betas"]
-        gradient, mean, square, weights = map(
-            to_numpy, (parameter.grad, state["exp_avg"], state["exp_avg_sq"], parameter)
-        )
-        # In place, with one array beside: Kingma and Ba 2015, algorithm 1.
-        change = gradient - mean
-        change *= 1 - slow
-        mean += change
-        np.multiply(gradient, gradient, out=change)
-        change -= square
-        change *= 1 - slower
-        square += change
-        np.sqrt(square, out=change)
-        change *= 1 / math.sqrt(1 - slower**count)
-        change += group["eps"]
-        np.divide(mean, change, out=change)
-        change *= group["lr"] / (1 - slow**count)
-        weights -= change
 
 
 def losses(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], objective: Objective) -> Metrics:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from prefrl.components import ConfigError, Settings, filled_in
 from prefrl.distributed import each_tensor, world
-from prefrl.improve.gradient import Batch, adam_of, steer, update
+from prefrl.improve.gradient import Batch, adam, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
@@ -203,7 +203,7 @@ class ControlLearner:
         self._player = Player(task, settings.environments)
         self.policy: ControlPolicy[Any] = settings.policy.build(task, rng)
         self.policy.to(device_of(settings.device))
-        self._optimizer = adam_of(self.policy, settings.learning_rate)
+        self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._span = 0.0, 0.0
         # Read when it is first needed: a run that goes on has a policy of its own, and what it began with may be gone.
         self._start = settings.start

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, TypeAlias, cast
+from typing import Any, Generic, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from prefrl.distributed import world
+from prefrl.fit.adam import Adam
 from prefrl.improve import by_hand
 from prefrl.improve.objectives import (
     Objective,
@@ -82,21 +83,25 @@ class Batch(Generic[I]):
                 yield self.rows(at)
 
 
-def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torch.optim.Adam:
+class Optimizer(Protocol):
+    """What takes gradient steps: `Adam`, or one of torch.optim's."""
+
+    @property
+    def param_groups(self) -> list[dict[str, Any]]: ...
+
+    def zero_grad(self) -> None: ...
+
+    def step(self) -> object: ...
+
+
+def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> Adam:
     """Adam with the eps of the PPO papers' code, which torch's default is a thousand times smaller than."""
-    return torch.optim.Adam(parameters, learning_rate, eps=1e-5, fused=True)
-
-
-def adam_of(policy: Policy[I], learning_rate: float) -> torch.optim.Adam:
-    """The same of all that a policy learns, by hand where its gradient is."""
-    if isinstance(policy, ByHand) and policy.works_by_hand:
-        return by_hand.Adam(policy.parameters(), learning_rate, eps=1e-5, fused=True)
-    return adam(policy.parameters(), learning_rate)
+    return Adam([{"params": list(parameters), "eps": 1e-5}], learning_rate)
 
 
 def update(
     policy: Policy[I],
-    optimizer: torch.optim.Optimizer,
+    optimizer: Optimizer,
     batch: Batch[I],
     minibatches: Iterable[Tensor],
     objective: Objective,
@@ -114,7 +119,7 @@ def update(
 
 def _update_by_hand(
     policy: ByHand[I],
-    optimizer: torch.optim.Optimizer,
+    optimizer: Optimizer,
     batch: Batch[I],
     minibatches: Iterable[Tensor],
     objective: Objective,
@@ -127,9 +132,7 @@ def _update_by_hand(
     return found
 
 
-def step(
-    policy: Policy[I], optimizer: torch.optim.Optimizer, batch: Batch[I], objective: Objective, part: int | None
-) -> Metrics:
+def step(policy: Policy[I], optimizer: Optimizer, batch: Batch[I], objective: Objective, part: int | None) -> Metrics:
     """One gradient step, by automatic differentiation.
 
     Metrics, means over steps unless said: loss, grad_norm (before it is shortened), policy_loss (averaged as the
@@ -145,7 +148,7 @@ def step(
 
 def descend(
     parameters: Iterable[torch.nn.Parameter],
-    optimizer: torch.optim.Optimizer,
+    optimizer: Optimizer,
     parts: Parts,
     max_grad_norm: float,
 ) -> Metrics:
@@ -170,7 +173,7 @@ def descend(
 
 def descend_by_logp(
     policy: Policy[I],
-    optimizer: torch.optim.Optimizer,
+    optimizer: Optimizer,
     inputs: I,
     loss_of: Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]],
     max_grad_norm: float,
@@ -191,7 +194,7 @@ def descend_by_logp(
 
 
 def _moved(
-    parameters: Iterable[torch.nn.Parameter], optimizer: torch.optim.Optimizer, metrics: Metrics, max_grad_norm: float
+    parameters: Iterable[torch.nn.Parameter], optimizer: Optimizer, metrics: Metrics, max_grad_norm: float
 ) -> Metrics:
     """Go down the gradient that the parameters have, and add how long it was to what was measured."""
     metrics["grad_norm"] = world().clip_gradients(parameters, max_grad_norm)
@@ -288,7 +291,7 @@ def _distances(ratios: Tensor, objective: Objective, steps: int) -> dict[str, Te
     }
 
 
-def steer(optimizer: torch.optim.Optimizer, kl: float, target: float, start: float) -> None:
+def steer(optimizer: Optimizer, kl: float, target: float, start: float) -> None:
     """Move the learning rate by a factor of 1.5 towards a KL of `target`, as far as a hundredth of `start` or tenfold.
 
     Nothing changes while the KL is within a factor of two of the target.

@@ -100,11 +100,11 @@ def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, disc
     delta = rewards + discount * next_values - values
     # Any end cuts the trace: what comes after a time limit is another episode, though its value still bootstraps.
     keep = discount * trace * (1.0 - ends.to(delta.dtype))
-    running, out = torch.zeros_like(delta[:, 0]), torch.empty_like(delta)  # (B,), (B, L)
-    for t in range(delta.shape[1] - 1, -1, -1):
-        running = delta[:, t] + keep[:, t] * running
-        out[:, t] = running
-    return out
+    running, found = torch.zeros_like(delta[:, 0]), []  # (B,)
+    for here, kept in reversed([*zip(delta.unbind(1), keep.unbind(1), strict=True)]):
+        running = here + kept * running
+        found.append(running)
+    return torch.stack(found[::-1], 1)
 
 
 # A score that is NaN was not given: it counts in no baseline, and what has it gets advantage 0.

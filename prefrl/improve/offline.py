@@ -22,7 +22,7 @@ from prefrl.exchange.recordings import recording
 from prefrl.fit.pairs import Batch, batch
 from prefrl.fit.split import split
 from prefrl.improve import gradient
-from prefrl.improve.gradient import adam_of, descend_by_logp, update
+from prefrl.improve.gradient import adam, descend_by_logp, update
 from prefrl.improve.objectives import Objective
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import Player
@@ -135,7 +135,7 @@ class Offline:
         network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
         self.policy, self._learns_std = MLPPolicy(network, task, rng, learns_std), learns_std
         self.policy.to(device_of(settings.device))
-        self.optimizer = adam_of(self.policy, settings.learning_rate)
+        self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
         self._data = _data(settings.data, task)
         self._seen = 0

@@ -189,10 +189,17 @@ def test_a_run_says_what_was_undone_and_ends_with_the_policy_that_stands(tmp_pat
 @pytest.mark.parametrize(
     ("schedule", "first", "last"), [("constant", 1.0, 1.0), ("linear", 1.0, 0.05), ("late", 1.0, 0.1)]
 )
-def test_the_learning_rate_falls_over_the_run(schedule: str, first: float, last: float) -> None:
+def test_the_learning_rate_falls_over_the_run(
+    schedule: str, first: float, last: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner, seen = built(schedule=schedule, target_kl=None, rollout_steps=200, epochs=1, critic_epochs=0), []
-    group = learner._optimizer.param_groups[0]
-    learner._optimizer.register_step_pre_hook(lambda *_: seen.append(group["lr"]))
+    group, step = learner._optimizer.param_groups[0], learner._optimizer.step
+
+    def watched() -> None:
+        seen.append(group["lr"])
+        step()
+
+    monkeypatch.setattr(learner._optimizer, "step", watched)
     for number in range(10):
         learner.pace(number / 10, (number + 1) / 10)
         learner.improve(NEAR, None, np.random.default_rng(number))  # type: ignore[arg-type]

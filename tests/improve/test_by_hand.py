@@ -12,7 +12,7 @@ from corridor import corridor
 from torch import Tensor
 
 from prefrl.improve import by_hand
-from prefrl.improve.gradient import Batch, adam, adam_of, step, update
+from prefrl.improve.gradient import Batch, adam, step, update
 from prefrl.improve.objectives import Objective
 from prefrl.policies.acting import Decisions
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
@@ -64,7 +64,7 @@ def stepped(head: str, dtype: torch.dtype, objective: Objective, hand: bool) -> 
     """The gradient of a minibatch, where the step led, and what it measured."""
     policy = policy_of(head, dtype)
     batch, rows = batch_of(policy, head, dtype), torch.arange(3, B)
-    optimizer = adam_of(policy, 1e-3) if hand else adam(policy.parameters(), 1e-3)
+    optimizer = adam(policy.parameters(), 1e-3)
     if hand:
         (metrics,) = update(policy, optimizer, batch, [rows], objective)
     else:
@@ -110,24 +110,6 @@ def test_what_is_not_finite_stops_it_before_anything_changes() -> None:
     batch, before = batch_of(policy, "box", torch.float32), policy.state()["parameters"]
     batch.advantages[5] = float("nan")
     with pytest.raises(FloatingPointError, match="the loss of a gradient step is nan"):
-        update(policy, adam_of(policy, 1e-3), batch, [torch.arange(B)], FULL)
+        update(policy, adam(policy.parameters(), 1e-3), batch, [torch.arange(B)], FULL)
     for name, parameter in policy.state()["parameters"].items():
         assert torch.equal(parameter, before[name])
-
-
-def test_adam_by_hand_goes_where_torchs_goes_and_takes_its_state_up() -> None:
-    generator = torch.Generator().manual_seed(0)
-    start, gradients = torch.randn(50, generator=generator), torch.randn(30, 50, generator=generator)
-    ours, theirs = torch.nn.Parameter(start.clone()), torch.nn.Parameter(start.clone())
-    one, other = by_hand.Adam([ours], 0.05, eps=1e-5), adam([theirs], 0.05)
-    for number, gradient in enumerate(gradients):
-        ours.grad, theirs.grad = gradient.clone(), gradient.clone()
-        one.step()
-        other.step()
-        torch.testing.assert_close(ours, theirs)
-        if number == 10:  # each goes on with the other's moments
-            one_state, other_state = one.state_dict(), other.state_dict()
-            one.load_state_dict(other_state)
-            other.load_state_dict(one_state | {"param_groups": other_state["param_groups"]})
-    with pytest.raises(ValueError, match="that has a gradient"):
-        by_hand.Adam([torch.nn.Parameter(torch.zeros(2))], 0.1).step()
