@@ -99,7 +99,7 @@ class ActionSpace:
         if self.squash:
             within = np.where(np.isfinite(self.clip), np.tanh(choices), choices)
         else:
-            within = np.clip(choices, -self.clip, self.clip)
+            within = choices.clip(-self.clip, self.clip)
         found: Floats = self.middle + self.half * within
         return found
 
