@@ -41,6 +41,8 @@ def write_file(path: Path, data: bytes) -> None:
 
 def make_folder(folder: Path) -> None:
     """Make a folder with what is above it, so that it survives a crash: an entry is only safe once its folder is."""
+    if folder.is_dir():  # nearly always, and cheaper than a look at all that is above it
+        return
     missing = [f for f in (folder, *folder.parents) if not f.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for made in missing:
