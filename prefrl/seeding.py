@@ -97,6 +97,15 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def keep_freed_memory() -> None:
+    """Let glibc's malloc keep what is freed, up to 64 MB, for the arrays that come next.
+
+    Else it gives a gradient step's arrays back to the system, and the next step's come again a page at a time. Its
+    thresholds rise to the largest block so far, of at most 32 MB, that was freed (mallopt(3), M_MMAP_THRESHOLD).
+    """
+    np.empty(31 << 20, np.uint8)  # freed at once, and never written to: it takes no memory
+
+
 def to_host(value: torch.Tensor) -> torch.Tensor:
     """In the memory of the CPU."""
     return value.cpu()

@@ -1,10 +1,12 @@
+import platform
+import resource
 from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 
-from prefrl.seeding import Streams, device_of, draw_seed, generator, keyed, streams, to_numpy
+from prefrl.seeding import Streams, device_of, draw_seed, generator, keep_freed_memory, keyed, streams, to_numpy
 
 
 def first(rng: np.random.Generator) -> int:
@@ -60,3 +62,17 @@ def test_an_array_of_a_parameter_shares_its_memory() -> None:
     parameter = torch.nn.Parameter(torch.zeros(2))
     to_numpy(parameter)[1] = 5.0
     assert parameter.tolist() == [0.0, 5.0]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators have ways of their own")
+def test_freed_memory_is_there_for_the_next_arrays() -> None:
+    keep_freed_memory()
+
+    def pages_asked_for() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(20):
+            [np.ones(1 << 17) for _ in range(8)]  # 8 MB, and freed
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    pages_asked_for()
+    assert pages_asked_for() < 4000  # of the 41,000 that these arrays have

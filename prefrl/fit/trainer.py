@@ -19,7 +19,7 @@ from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
 from prefrl.judgements import Judged
 from prefrl.protocols import Judgements, RewardModel
-from prefrl.seeding import to_numpy
+from prefrl.seeding import keep_freed_memory, to_numpy
 from prefrl.types import C, Fitted, Floats, Metrics
 
 
@@ -61,6 +61,7 @@ def fit_judged(
         raise NothingToFit("there are no judgements to fit on; expected at least one that prefers a candidate")
     if not prefers(judged):
         raise NothingToFit(f"all {len(judged)} judgements are ties; expected at least one that prefers a candidate")
+    keep_freed_memory()
     held_out = split(judged, fitting.held_out)
     data = compared(judged, held_out.tolist())
     problem = _problem(reward, judged, held_out, fitting, unjudged, rng)
