@@ -186,3 +186,15 @@ def test_a_learned_std_narrows_where_the_expert_is_sure(tmp_path: Path) -> None:
         stds.append(float(one.policy.state()["parameters"]["log_std"].exp()))
     assert stds[0] == pytest.approx(0.7)
     assert stds[1] < 0.3
+
+
+def test_what_the_normaliser_sees_later_does_not_change_a_clone(tmp_path: Path) -> None:
+    """One rollout without a gradient step once turned a good clone into a bad policy."""
+    task = point()
+    one = learner(task)
+    one.improve(cast(Any, Known()), shown(tmp_path, task, to_the_middle, episodes=4), np.random.default_rng(0))
+    seen = np.linspace(-1, 1, 21, dtype=np.float32)[:, None]
+    before, _ = one.actor()(seen, None, None)
+    one.policy.observe(np.random.default_rng(0).normal(5.0, 3.0, (500, 1)).astype(np.float32))
+    after, _ = one.actor()(seen, None, None)
+    np.testing.assert_allclose(before, after, atol=1e-4)

@@ -222,6 +222,18 @@ def test_a_reward_that_the_run_began_with_is_not_called_fitted(tmp_path: Path) -
     assert "Was the reward model right?" not in found.text
 
 
+def test_a_run_that_was_shown_what_to_do_says_that_nothing_was_compared(tmp_path: Path) -> None:
+    lines = [
+        line(0),
+        line(1, **{"improve/demonstrations": 4, "improve/cloning_loss": 0.3}) | {"evaluate/learned": None},
+    ]
+    unfitted = [{k: v for k, v in one.items() if not k.startswith("fit/")} for one in lines]
+    found = page(run_folder(tmp_path / "run", unfitted, summary=summary()))
+    assert "It learned from 4 demonstrations; nothing was compared." in found.text
+    fitted = page(run_folder(tmp_path / "both", [line(0), line(1, **{"improve/demonstrations": 4})], summary=summary()))
+    assert "nothing was compared" not in fitted.text
+
+
 def test_noise_is_told_from_change_by_the_intervals_of_the_means(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/count": 100.0, "evaluate/gold_std": 40.0}) for i in range(2)]
     near = page(run_folder(tmp_path / "near", lines, summary=summary(gold_after=-95.0)))
