@@ -114,7 +114,8 @@ class ControlLearnerSettings(Settings):
     """The network that acts, and its critic."""
     start: Path | None = None
     """A run of control, or a zip of stable-baselines3, whose policy this one starts from, with its critic, its noise
-    and its normaliser; from the working directory where it is relative. It needs the same widths and spaces."""
+    and its normaliser, which stays what it was; from the working directory where it is relative. It needs the same
+    widths and spaces."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
     device: Device = "auto"
@@ -337,7 +338,10 @@ class ControlLearner:
         """Take over the policy that this one starts from, once."""
         if self._start is not None:
             assert isinstance(self._settings.policy, MLPPolicySettings)
+            assert isinstance(self.policy, MLPPolicy)
             self.policy.load(starting_state(self._start, self._task, self._settings.policy))
+            # Few demonstrations show a part of the world: what lies elsewhere would change every scale at once.
+            self.policy.freeze()
             self._start = None
 
     def _rollout_lengths(self) -> list[int]:

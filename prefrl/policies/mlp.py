@@ -124,6 +124,10 @@ class MLPPolicy:
         """(..., O) -> (..., O) float32, by the statistics so far."""
         return self.normaliser.now()(observations)
 
+    def freeze(self) -> None:
+        """See observations from now on as they are seen now."""
+        self.normaliser.frozen = True
+
     def observe(self, observations: Floats) -> None:
         """Add observations (..., O) to the normaliser's statistics, and let the first layers follow."""
         move = self.normaliser.observe(observations)

@@ -61,6 +61,8 @@ class Normaliser:
         self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 0.0
         self.raw = False
         """Whether observations are seen as they are, for good: by a policy that learned without a normaliser."""
+        self.frozen = False
+        """Whether the statistics stay what they are, for good."""
 
     @property
     def scale(self) -> Floats:
@@ -79,7 +81,7 @@ class Normaliser:
         ruined policies. The first time there is none, when weights are random and are to see inputs of one size. Never
         between acting and learning: the probability ratio would not start at 1.
         """
-        if self.raw:
+        if self.raw or self.frozen:
             return None
         mean, scale = self.mean, self.scale
         # In float64: float32 sums lose small changes over many rounds.
@@ -93,11 +95,12 @@ class Normaliser:
 
     def state(self) -> State:
         found = {"mean": self.mean, "variance": self.variance, "count": self.count}
-        return found | {"raw": True} if self.raw else found
+        flags = {"raw": self.raw, "frozen": self.frozen}
+        return found | {name: True for name, is_set in flags.items() if is_set}
 
     def load(self, state: State) -> None:
         self.mean, self.variance, self.count = state["mean"], state["variance"], state["count"]
-        self.raw = state.get("raw", False)
+        self.raw, self.frozen = state.get("raw", False), state.get("frozen", False)
 
     def _move(self, mean: Floats, scale: Floats) -> Move:
         """From these statistics (O,) to the present ones."""
