@@ -26,11 +26,10 @@ from typing import Any
 import numpy as np
 
 EPISODES, EPOCHS, MINIBATCH, RATE = 20, 200, 64, 1e-3
-NOISE = 0.3
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 SETTINGS = {
     "clone": ["control/pendulum-demos", "labeler.noise=0"],
-    "noise": ["control/pendulum-demos", f"labeler.noise={NOISE}"],
+    "noise": ["control/pendulum-demos"],
     "dagger": ["control/pendulum-dagger"],
 }
 
