@@ -19,6 +19,7 @@ from prefrl.fit.settings import FittingSettings, check_settings
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
+    Imitates,
     Labeler,
     LabelerSettings,
     Learner,
@@ -149,7 +150,7 @@ class Config(Settings):
         task = self.build_task()
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         labeler = self.build_labeler(task)
-        self._check_candidates(labeler)
+        self._check_labeler(labeler, learner)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)
@@ -169,14 +170,20 @@ class Config(Settings):
             threads=self.learner.threads if isinstance(self.learner, Threaded) else None,
         )
 
-    def _check_candidates(self, labeler: Labeler) -> None:
-        """Raises `ConfigError` where the labeler cannot answer about so many candidates."""
+    def _check_labeler(self, labeler: Labeler, learner: Learner) -> None:
+        """Raises `ConfigError` where the labeler cannot answer about so many candidates, or nobody learns from it."""
         count, shows = cast(SelectorSettings, self.select).candidates, isinstance(labeler, Demonstrates)
         if self.loop.labels and shows != (count == 1):
             says = "shows what to do in the states of one" if shows else "compares two or more"
             raise ConfigError(
                 f"select.candidates={count}, but the labeler ({self.labeler.model_dump()['kind']}) {says}: set "
                 f"select.candidates={1 if shows else 2}, or choose another labeler"
+            )
+
+        if self.loop.labels and shows and not isinstance(learner, Imitates):
+            raise ConfigError(
+                f"learner.kind={self.learner.model_dump()['kind']} learns nothing from demonstrations, and the labeler "
+                "gives no other answers: set learner.kind=clone, and start from that run's policy with learner.start"
             )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

@@ -34,6 +34,8 @@ from prefrl.protocols import ControlTask, Recorded, RewardModel, Store
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Integers, Metrics, Segment, State, Steps
 
+ROUNDING = 1e-4
+"""By how much an action may lie outside of its bounds: files hold them in few digits."""
 AT_ONCE = 8
 """Environments that are stepped side by side, where there are any."""
 
@@ -137,7 +139,7 @@ class Offline:
         self.policy.to(device_of(settings.device))
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
-        self._data = _data(settings.data, task)
+        self._data = _data(settings.data, task, settings.imitates)
         self._seen = 0
 
     def imitates(self, store: Store[Segment]) -> bool:
@@ -148,8 +150,9 @@ class Offline:
         return self._player.steps
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
-        """Pieces of the file, as many as it has; without one, of what the policy does (query steps)."""
-        if not self._data:
+        """Pieces of the file, as many as it has; without one, or to be shown what to do, of what the policy does (query
+        steps)."""
+        if not self._data or (self._settings.imitates and not isinstance(self._task, Recorded)):
             return self._player.sample(count, self._act(rng), rng)
         length = self._task.segment_steps
         places = [(i, t) for i, one in enumerate(self._data) for t in range(len(one) - length + 1)]
@@ -225,6 +228,8 @@ class Offline:
         if self.policy.normaliser.count and not self._settings.imitates:
             return {}
         if new := segments[self._seen :]:
+            for one in new:
+                _check_shown(one, self._task)
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
         settings, recordings = self._settings, Recordings.of(segments, self.policy)
@@ -269,6 +274,22 @@ class Offline:
         return lambda observations, legal, begins: actor(observations, rng, legal)
 
 
+def _check_shown(one: Segment, task: ControlTask) -> None:
+    """Raise `ValueError` where a behaviour cannot be cloned."""
+    kind, bounds = kind_of(one), task.action_bounds
+    fault = kind.misfit(one, task) or kind.fault(one) or ("has no step" if not len(one) else "")
+    if not fault and bounds is None and not (np.isin(one.actions, (0, 1)) & (one.actions.sum(1) == 1)[:, None]).all():
+        fault = "has actions that are not one-hot, and those of the task are discrete"
+    if not fault and bounds is not None:
+        low, high = (np.asarray(side) for side in bounds)
+        outside = (one.actions < low - ROUNDING) | (one.actions > high + ROUNDING)
+        if outside.any():
+            step = int(outside.any(1).argmax())
+            fault = f"has the action {one.actions[step]} in step {step}, outside of the bounds {low} to {high}"
+    if fault:
+        raise ValueError(f"the demonstration {one.episode!r} from step {one.start} {fault}: leave it out, or mend it")
+
+
 def _nothing(settings: OfflineSettings) -> str:
     if settings.imitates:
         return f"{settings.kind} learns from demonstrations: set labeler.kind=expert or learner.data, or import some"
@@ -281,11 +302,15 @@ def minibatches(count: int, epochs: int, size: int, rng: np.random.Generator) ->
         yield from shuffled(count, size, rng)
 
 
-def _data(path: Path | None, task: ControlTask) -> tuple[Segment, ...]:
+def _data(path: Path | None, task: ControlTask, imitates: bool) -> tuple[Segment, ...]:
     """The segments of the file, or of the task. Raises `ValueError` where they do not fit the task."""
     if path is None:
         return tuple(task.segments) if isinstance(task, Recorded) else ()
     found = recording(path).segments
+    if imitates:  # any length will do
+        for one in found:
+            _check_shown(one, task)
+        return found
     if misfit := kind_of(found[0]).misfit(found[0], task):
         raise ValueError(f"learner.data: a segment of {path} {misfit}: choose another file or task")
     if all(len(one) < task.segment_steps for one in found):

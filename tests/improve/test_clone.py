@@ -207,3 +207,40 @@ def test_a_learner_that_starts_from_a_clone_keeps_what_it_does_whatever_it_sees(
     again.load(other.state())  # nor after a resumption
     again.policy.observe(np.full((500, 1), 9.0, np.float32))
     np.testing.assert_allclose(again.actor()(seen, None, None)[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("seen", "actions", "says"),
+    [
+        (np.ones((2, 1)), np.array([[0.5], [1.5]]), r"has the action \[1\.5\] in step 1, outside of the bounds"),
+        (np.array([[0.0], [np.nan]]), np.zeros((2, 1)), "has observations that are not all finite"),
+        (np.ones((2, 3)), np.zeros((2, 1)), "but .* has"),
+        (np.ones((0, 1)), np.zeros((0, 1)), "has no step"),
+    ],
+)
+def test_what_cannot_be_cloned_is_refused_by_name(tmp_path: Path, seen: Floats, actions: Floats, says: str) -> None:
+    bad = Segment(seen.astype(np.float32), actions.astype(np.float32), "bad one", 0)
+    query = Query((bad,))
+    with Store[Segment](tmp_path) as store:
+        store.ask([query])
+        store.answer([Demonstration(query.id, bad.id, "ann")])
+        with pytest.raises(ValueError, match=f"demonstration 'bad one' from step 0 .*{says}"):
+            learner(point()).improve(cast(Any, Known()), store, np.random.default_rng(0))
+
+
+def test_discrete_actions_that_are_not_one_hot_are_refused(tmp_path: Path) -> None:
+    bad = Segment(np.ones((2, 1), np.float32), np.full((2, 2), 0.5, np.float32), "bad", 0)
+    query = Query((bad,))
+    with Store[Segment](tmp_path) as store:
+        store.ask([query])
+        store.answer([Demonstration(query.id, bad.id, "ann")])
+        with pytest.raises(ValueError, match="not one-hot"):
+            learner(point(discrete=True)).improve(cast(Any, Known()), store, np.random.default_rng(0))
+
+
+def test_what_is_asked_about_is_the_learners_own_behaviour_whatever_file_it_clones(tmp_path: Path) -> None:
+    shown(tmp_path, point(), to_the_middle, episodes=2)
+    one = learner(point(), data=tmp_path)
+    assert one.imitates(cast(Any, None))
+    asked = one.sample(3, np.random.default_rng(0))
+    assert all(segment.episode.startswith("round 0") for segment in asked)

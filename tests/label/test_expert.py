@@ -93,6 +93,7 @@ def test_what_compares_is_for_other_labelers(pendulum: ControlTask, tmp_path: Pa
             "select.candidates=2, but the labeler (expert) shows what to do in the states of one",
         ),
         (["labeler.kind=oracle"], "select.candidates=1, but the labeler (oracle) compares two or more"),
+        (["learner.kind=control"], "learner.kind=control learns nothing from demonstrations"),
     ],
 )
 def test_how_many_are_asked_about_must_fit_the_labeler(tmp_path: Path, settings: list[str], says: str) -> None:
