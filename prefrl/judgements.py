@@ -149,6 +149,17 @@ class Demonstrated(Generic[C]):
         if self.like.context != self.query.candidates[0].context:
             raise ValueError(f"query {self.query.id[:12]} is answered by a behaviour of another context (prompt)")
 
+    def implied(self, weight: float) -> Judged[C] | None:
+        """That what was shown is better than the learner's own (Ibarz et al. 2018), with `weight` times the weight of
+        the demonstration; None where a behaviour stands for itself."""
+        (own,) = self.query.candidates
+        if own.id == self.like.id:
+            return None
+        pair = Query((own, self.like))
+        first = float(pair.candidates[0].id == self.like.id)
+        shown = self.demonstration
+        return Judged(pair, Comparison(pair.id, first, shown.labeler, weight=weight * shown.weight))
+
 
 @dataclass(frozen=True)
 class Judged(Generic[C]):

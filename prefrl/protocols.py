@@ -298,6 +298,9 @@ class Judgements(Protocol[C]):
     def judged(self, upto: int | None = None) -> list[Judged[C]]:
         """Queries with their judgements, in the order in which they were given, up to a sequence number."""
 
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[C]]:
+        """Queries with the behaviours that answer them, as `judged`."""
+
     def open_queries(self, labeler: str = "") -> list[Query[C]]:
         """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""
 
@@ -319,9 +322,6 @@ class Store(Judgements[C], Protocol[C]):
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""
-
-    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[C]]:
-        """Queries with the behaviours that answer them, as `judged`."""
 
     def counts(self) -> dict[str, int]:
         """Queries asked, answered, skipped."""

@@ -26,7 +26,7 @@ from prefrl.improve.kto import KTOSettings
 from prefrl.improve.online_dpo import OnlineDPOSettings
 from prefrl.improve.raft import RAFTSettings
 from prefrl.improve.text import TextLearnerSettings
-from prefrl.judgements import Comparison, Judged
+from prefrl.judgements import Comparison, Demonstrated, Judged
 from prefrl.policies.divided import Divided, environments
 from prefrl.policies.rollout import collect
 from prefrl.protocols import RewardModel
@@ -204,6 +204,9 @@ class Few:
 
     def judged(self, upto: int | None = None) -> list[Judged[Response]]:
         return self._judged
+
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[Response]]:
+        return []
 
 
 def rewards(cache: Path) -> Found:

@@ -13,7 +13,7 @@ from prefrl.exchange.bundles import is_bundle
 from prefrl.exchange.formats import read_judgements
 from prefrl.exchange.layout import Which
 from prefrl.exchange.ports import import_judgements
-from prefrl.judgements import Judged, person
+from prefrl.judgements import Demonstrated, Judged, person
 from prefrl.kinds import kind_of
 from prefrl.protocols import Judgements
 from prefrl.storage.files import DamagedError
@@ -34,6 +34,9 @@ class InMemory:
 
     def judged(self, upto: int | None = None) -> list[Judged]:
         return list(self.of_file[:upto])
+
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated]:
+        return []
 
     def open_queries(self, labeler: str = "") -> list[Query]:
         return []

@@ -38,6 +38,8 @@ class FittingSettings(Settings):
     """`learned` estimates how often each labeler errs, together with the reward; `error_rate` is then not used."""
     denoise: Literal["off", "filter", "flip"] = "off"
     """Leave out judgements that the model finds improbable, and turn round those it finds all but impossible (RIME)."""
+    demonstrations: float = Field(1.0, ge=0)
+    """What it counts, beside judgements, that a demonstration is better than what it answers; 0 leaves that out."""
     held_out: float = Field(0.15, ge=0, lt=1)
     """The share of judgements that is never trained on, and measures accuracy and calibration."""
     bootstrap: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from prefrl.fit.pairs import Batch, compared
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import prefers, split
 from prefrl.fit.terms import Terms, terms
-from prefrl.judgements import Judged
+from prefrl.judgements import Demonstrated, Judged
 from prefrl.protocols import Judgements, RewardModel
 from prefrl.seeding import keep_freed_memory, to_numpy
 from prefrl.types import C, Fitted, Floats, Metrics
@@ -34,7 +35,7 @@ def fit(
     rng: np.random.Generator,
     unjudged: Sequence[C] = (),
 ) -> Fitted:
-    """Fit `reward` on a snapshot of the store: all judgements up to its newest event.
+    """Fit `reward` on a snapshot of the store: all judgements up to its newest event, and what demonstrations imply.
 
     `unjudged` candidates are for pseudo-labels; open queries give some too. Raises `NothingToFit` where there is no
     judgement, or only ties.
@@ -44,9 +45,15 @@ def fit(
     if fitting.pseudo_labels:
         waiting: list[C] = [c for query in store.open_queries() for c in query.candidates]
         unjudged = list(unjudged) + waiting
-    fitted = fit_judged(reward, store.judged(snapshot), fitting, rng, unjudged)
+    shown = _implied(store.demonstrations(snapshot), fitting.demonstrations) if fitting.demonstrations else []
+    fitted = fit_judged(reward, [*store.judged(snapshot), *shown], fitting, rng, unjudged)
     fitted.metrics["snapshot"] = float(snapshot)
-    return fitted
+    return replace(fitted, metrics=fitted.metrics | {"shown": float(len(shown))}) if shown else fitted
+
+
+def _implied(demonstrations: Sequence[Demonstrated[C]], weight: float) -> list[Judged[C]]:
+    found = (one.implied(weight) for one in demonstrations)
+    return [one for one in found if one is not None]
 
 
 def fit_judged(

@@ -1,5 +1,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from prefrl.fit.pairs import batch
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.split import split
 from prefrl.fit.trainer import NothingToFit, fit, fit_judged
-from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
+from prefrl.judgements import Choice, Comparison, Demonstrated, Demonstration, Judged, Ranking, Rating
 from prefrl.label.oracle import Oracle, OracleSettings
 from prefrl.store import Store
 from prefrl.types import Query, Segment
@@ -510,3 +511,37 @@ def test_cropped_segments_still_teach(judged: list[Judged[Segment]], make_segmen
     fit_judged(reward, judged, FittingSettings(epochs=60, crop=0.4), np.random.default_rng(0))
     fresh = [make_segment() for _ in range(200)]
     assert pearsonr(reward.score(fresh), [planted(s) for s in fresh]).statistic > 0.9
+
+
+def test_what_was_shown_is_better_than_what_it_answers(tmp_path: Path, make_segment: Callable[..., Segment]) -> None:
+    """Demonstrations and judgements in one fit; those that stand for themselves say nothing."""
+    with Store[Segment](tmp_path) as store:
+        own = [make_segment() for _ in range(60)]
+        better = [replace(one, actions=one.actions + np.array([2.0, 0.0], np.float32)) for one in own]
+        queries = [Query((one,)) for one in own]
+        store.ask(queries)
+        store.keep(better)
+        store.answer([Demonstration(q.id, b.id) for q, b in zip(queries[1:], better[1:], strict=True)])
+        store.answer([Demonstration(queries[0].id, own[0].id)])
+        off = FittingSettings(demonstrations=0.0)
+        with pytest.raises(NothingToFit):
+            fit(model(), store, off, np.random.default_rng(0))
+        pair = judge(Query((make_segment(), make_segment())))
+        store.ask([pair.query])
+        store.answer([pair.judgement])
+        reward = model()
+        fitted = fit(reward, store, FittingSettings(epochs=40), np.random.default_rng(0))
+        assert (fitted.metrics["judgements"], fitted.metrics["shown"]) == (60, 59)
+        assert (reward.score(better) > reward.score(own)).mean() > 0.9
+        assert "shown" not in fit(model(), store, off, np.random.default_rng(0)).metrics
+
+
+def test_what_was_shown_counts_by_its_weight_and_that_of_the_fit() -> None:
+    own, like = (Segment(np.full((2, 1), x, np.float32), np.zeros((2, 1), np.float32), "e", 0) for x in (0.0, 1.0))
+    query = Query((own,))
+    found = Demonstrated(query, like, Demonstration(query.id, like.id, "ann", weight=2.0)).implied(0.5)
+    assert found is not None
+    assert isinstance(found.judgement, Comparison)
+    assert (found.judgement.weight, found.judgement.labeler) == (1.0, "ann")
+    assert found.judgement.preference == float(found.query.candidates[0].id == like.id)
+    assert Demonstrated(query, own, Demonstration(query.id, own.id)).implied(1.0) is None

@@ -43,7 +43,7 @@ class Answers:
         leads = [float(-np.diff(reward.score(query.candidates))[0]) for query in pairs]
         self._judged = [Judged(q, Comparison(q.id, answer(lead))) for q, lead in zip(pairs, leads, strict=True)]
 
-    def demonstrations(self) -> list[Demonstrated[Response]]:
+    def demonstrations(self, upto: int | None = None) -> list[Demonstrated[Response]]:
         return []
 
     def judged(self) -> list[Judged[Response]]:
