@@ -4,9 +4,9 @@
 
 A ledge: "on" goes on, anything else falls, and whoever has fallen stays there until "climb". The expert never falls, so
 a clone never sees what to do then. DAgger's expert answers 8 segments of 10 of the learner's own steps in each of 8
-rounds. Both have 800 answered steps and as many passes, and draw from their policies. Counted are mistakes of an episode,
-where the action is not the expert's, for horizons of 10 to 160. Writes TO.csv and TO.svg; the last line is one JSON
-object: `slope_clone` and `slope_dagger` are slopes of log mistakes over log horizon, medians over seeds.
+rounds. Both have 800 answered steps and as many passes, and draw from their policies. What counts are mistakes of an
+episode, actions that are not the expert's, for horizons of 10 to 160. Writes TO.csv and TO.svg; the last line is one
+JSON object: `slope_clone` and `slope_dagger` are slopes of log mistakes over log horizon, medians over seeds.
 """
 
 from __future__ import annotations

@@ -26,5 +26,5 @@ def _swing_up(observations: Floats) -> Floats:
     return found
 
 
-EXPERTS: dict[str, Callable[[Floats], Floats]] = {"Pendulum-v1": _swing_up}
-"""Observations (n, O) -> actions (n, A), by gymnasium's id."""
+EXPERTS: dict[str, tuple[int, Callable[[Floats], Floats]]] = {"Pendulum-v1": (3, _swing_up)}
+"""O, and observations (n, O) -> actions (n, A), by gymnasium's id; for the environment's own options."""

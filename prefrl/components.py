@@ -80,6 +80,7 @@ TABLE: dict[Role, dict[str, str]] = {
     },
     "labelers": {
         "crowd": "prefrl.label.crowd:CrowdSettings",
+        "demonstrator": "prefrl.label.demonstrator:DemonstratorSettings",
         "expert": "prefrl.label.expert:ExpertSettings",
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",

@@ -177,13 +177,14 @@ class Config(Settings):
             says = "shows what to do in the states of one" if shows else "compares two or more"
             raise ConfigError(
                 f"select.candidates={count}, but the labeler ({self.labeler.model_dump()['kind']}) {says}: set "
-                f"select.candidates={1 if shows else 2}, or choose another labeler"
+                f"{'select.kind=uniform select.candidates=1' if shows else 'select.candidates=2'}, or choose another"
             )
 
-        if self.loop.labels and shows and not isinstance(learner, Imitates):
+        if self.loop.labels and shows and not (isinstance(learner, Imitates) or self.fitting.demonstrations):
             raise ConfigError(
                 f"learner.kind={self.learner.model_dump()['kind']} learns nothing from demonstrations, and the labeler "
-                "gives no other answers: set learner.kind=clone, and start from that run's policy with learner.start"
+                "gives no other answers: set fitting.demonstrations=1, for a reward that is fitted on them, or "
+                "learner.kind=clone"
             )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

@@ -310,4 +310,4 @@ def is_pairwise(answer: Answer) -> bool:
 def check_weight(weight: float) -> None:
     """Raise `ValueError` for a weight that says nothing."""
     if not 0.0 < weight < math.inf:
-        raise ValueError(f"a judgement's weight must be positive and finite, got {weight}")
+        raise ValueError(f"the weight of an answer must be positive and finite, got {weight}")

@@ -130,8 +130,7 @@ def shared(loop: Loop[C]) -> Loop[C]:
     if isinstance(loop.learner, Divides):
         loop.learner.check_ranks(size)
         return replace(loop, fit=fit_once)
-    name = type(loop.learner).__name__
-    text(loop.task, f"{size} ranks can share the learner {name} on text alone (of control, learner.kind=control)")
+    text(loop.task, f"{size} ranks can share learners of text, and of control learner.kind=control alone")
     return loop
 
 

@@ -113,10 +113,16 @@ def drive(running: Run) -> None:
         console.print(summary_table(running.summary))
         say(f"report: {running.report()}")
         if not (running.loop.reward.fitted or running.loop.imitates):
-            raise ValueError(
-                "nothing was learned: nothing was shown, and no judgement ever preferred a candidate; look at the "
-                "labeler's settings"
-            )
+            raise ValueError(_nothing_learned(running))
+
+
+def _nothing_learned(running: Run) -> str:
+    if shown := len(running.loop.store.demonstrations()):
+        return (
+            f"nothing was learned: there are {shown} demonstrations and no judgements, and this learner learns from "
+            "judgements; set learner.kind=clone, or sft for text"
+        )
+    return "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 from datetime import datetime
 from enum import StrEnum
@@ -181,17 +182,26 @@ def demonstrate(
         Path | None, typer.Option(help="Who acts: a run of control, or a zip. Default: the task's own expert.")
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="How many whole episodes are shown.")] = 4,
-    noise: Annotated[float, typer.Option(min=0, help="Std of what is executed beside it, in half the bounds.")] = 0.0,
+    noise: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Noise in what is executed: a std in half the bounds, or a share of discrete actions."
+        ),
+    ] = 0.0,
 ) -> None:
     """Let an expert show whole episodes, which can be cloned: `learner.data=FOLDER` reads them."""
     from prefrl import stages
     from prefrl.cli.console import say
+    from prefrl.storage.log import has_store
 
+    _refuse(has_store(out), f"{out} holds answers already: say with --out where new demonstrations go")
     policy = [f"labeler.policy={json.dumps(str(expert))}"] if expert else []
     shows = ["labeler.kind=expert", f"labeler.episodes={episodes}", f"labeler.noise={noise}", *policy]
-    stages.label(_load(source, [*shows, "select.candidates=1", "loop.labels=0", *(overrides or [])]), out, tell=say)
-    settings = f"learner.kind=clone learner.data={out} loop.labels=0 loop.rounds=1"
-    say(f"{_progress(out)}. Clone them with: prefrl run {source} {settings}")
+    asks = ["select.kind=uniform", "select.candidates=1", "loop.labels=0"]
+    stages.label(_load(source, [*shows, *asks, *(overrides or [])]), out, tell=say)
+    same = [override for override in overrides or [] if override.startswith("task.")]
+    clone = [source, *same, "learner.kind=clone", f"learner.data={out}", "loop.labels=0", "loop.rounds=1"]
+    say(f"{_progress(out)}. Clone them with: {shlex.join(['prefrl', 'run', *clone])}")
 
 
 @app.command()

@@ -90,7 +90,8 @@ def form_of(row: Fields) -> str:
     if row.get("responses") is not None:
         return "responses"
     if "completion" in row and "chosen" not in row:
-        return "unpaired" if "label" in row else "demonstrations"
+        # A column of another name may be the label: a bad response is not to be taken for a good one.
+        return "unpaired" if set(row) - {"prompt", "completion", "query", "at", *EXTRA} else "demonstrations"
     return "preferences"
 
 
@@ -194,6 +195,8 @@ def _completion(row: Fields) -> Response:
 def _demonstration(row: Fields) -> list[Row | str]:
     """One response that shows what is wanted."""
     shown = _completion(row)
+    if not shown.text:
+        raise ValueError("column 'completion': expected what a good response is like, got an empty text")
     return [answered(row, [shown], partial(_like, shown.id))]
 
 

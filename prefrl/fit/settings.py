@@ -40,6 +40,9 @@ class FittingSettings(Settings):
     """Leave out judgements that the model finds improbable, and turn round those it finds all but impossible (RIME)."""
     demonstrations: float = Field(1.0, ge=0)
     """What it counts, beside judgements, that a demonstration is better than what it answers; 0 leaves that out."""
+    newest: int | None = Field(None, ge=1)
+    """Fit on so many of the newest judgements alone, and on what so many of the newest demonstrations imply; null for
+    all of them. For answers that grow old as the policy changes, as a demonstrator's do."""
     held_out: float = Field(0.15, ge=0, lt=1)
     """The share of judgements that is never trained on, and measures accuracy and calibration."""
     bootstrap: bool = True

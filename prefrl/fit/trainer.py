@@ -46,7 +46,8 @@ def fit(
         waiting: list[C] = [c for query in store.open_queries() for c in query.candidates]
         unjudged = list(unjudged) + waiting
     shown = _implied(store.demonstrations(snapshot), fitting.demonstrations) if fitting.demonstrations else []
-    fitted = fit_judged(reward, [*store.judged(snapshot), *shown], fitting, rng, unjudged)
+    shown, judged = shown[-(fitting.newest or 0) :], store.judged(snapshot)[-(fitting.newest or 0) :]
+    fitted = fit_judged(reward, [*judged, *shown], fitting, rng, unjudged)
     fitted.metrics["snapshot"] = float(snapshot)
     return replace(fitted, metrics=fitted.metrics | {"shown": float(len(shown))}) if shown else fitted
 

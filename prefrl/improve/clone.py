@@ -45,5 +45,5 @@ class CloneSettings(OfflineSettings):
 
 
 def improve(learner: Offline, material: Material, reward: RewardModel[Segment], rng: np.random.Generator) -> Metrics:
-    """Nothing beside what all of these learners do first, which is to clone. Metrics: demonstrations, how many."""
+    """Nothing more: `Offline` clones before it comes here. Metrics: demonstrations, how many."""
     return {"demonstrations": float(len(material.segments))}

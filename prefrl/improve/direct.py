@@ -54,7 +54,7 @@ class DirectSettings(Settings):
     """Where the policy and the reward model compute: `auto` is the GPU where there is one."""
     discount: ClassVar[float] = 1.0  # a response is judged as a whole
     imitates: ClassVar[bool] = False
-    """Whether it learns from demonstrations, and so needs no judgement."""
+    """Whether it learns from demonstrations, with or without judgements."""
 
     def with_evaluation_of(self, other: Self) -> Self:
         return self.model_copy(update={"evaluation_prompts": other.evaluation_prompts})

@@ -31,6 +31,7 @@ from prefrl.policies.acting import Actor, Decisions
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask, Recorded, RewardModel, Store
+from prefrl.sample.segments import piece
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Integers, Metrics, Segment, State, Steps
 
@@ -47,8 +48,9 @@ class OfflineSettings(Settings):
     imitates: ClassVar[bool] = False
     """Whether it learns from what is shown alone, in every round, and needs no judgement."""
     data: Path | None = None
-    """Behaviour to learn from beside what was judged: an .npz file of segments, or a Minari data set. What is asked
-    about is cut from it as well. A task of kind `segments` has a file already."""
+    """Behaviour to learn from beside what was judged or shown: an .npz file of segments, a Minari data set, or a folder
+    of demonstrations. What is asked about is cut from it as well, but by `clone`, which asks about its own. A task of
+    kind `segments` has a file already."""
     learning_rate: float = Field(1e-3, gt=0)
     """Adam's."""
     max_grad_norm: float = Field(1.0, gt=0)
@@ -157,7 +159,7 @@ class Offline:
         length = self._task.segment_steps
         places = [(i, t) for i, one in enumerate(self._data) for t in range(len(one) - length + 1)]
         chosen = rng.choice(len(places), min(count, len(places)), replace=False)
-        return [_piece(self._data[i], t, length) for i, t in (places[c] for c in sorted(chosen))]
+        return [piece(self._data[i], t, length) for i, t in (places[c] for c in sorted(chosen))]
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Clone in the first round, and learn by the method. Metrics: the method's, and cloning_loss where it cloned
@@ -316,12 +318,6 @@ def _data(path: Path | None, task: ControlTask, imitates: bool) -> tuple[Segment
     if all(len(one) < task.segment_steps for one in found):
         raise ValueError(f"learner.data: {path} has no segment of task.segment_steps={task.segment_steps} steps")
     return found
-
-
-def _piece(one: Segment, start: int, length: int) -> Segment:
-    part = slice(start, start + length)
-    states, gold = (None if x is None else x[part] for x in (one.states, one.gold))
-    return Segment(one.observations[part], one.actions[part], one.episode, one.start + start, states, gold)
 
 
 __all__: Sequence[str] = ("Improve", "Material", "Offline", "OfflineSettings", "Recordings", "minibatches")

@@ -35,16 +35,20 @@ class ExpertSettings(Settings):
     name: str = Field("expert", min_length=1)
     """Who shows; kept with every answer."""
     policy: Path | None = None
-    """Whose actions they are: the folder of a run of control, or a zip of stable-baselines3. Null for the expert that
-    is known for the task, which Pendulum-v1 has."""
+    """Whose actions they are: the folder of a run of control on this task, or a zip of stable-baselines3. Null for the
+    expert that is known for the task, which Pendulum-v1 has."""
     episodes: int = Field(4, ge=0)
-    """Whole episodes of the expert's own, shown before anything is asked."""
+    """Whole episodes of the expert's own, shown before anything is asked; those that are there already count."""
     noise: float = Field(0.0, ge=0)
     """Of what is executed in these episodes, as a std in half the action bounds, or for discrete actions the share that
     is drawn at random. What is shown are the actions without it: so the learner sees how to come back."""
 
     def build(self, task: Task) -> Expert:
         found = simulated(task, f"labeler kind {self.kind!r} acts in control tasks")
+        if found.action_bounds is None and self.noise > 1:
+            raise ConfigError(
+                f"labeler.noise: of discrete actions it is a share, so expected at most 1, got {self.noise}"
+            )
         return Expert(self, found, advice_of(self.policy, found))
 
 
@@ -70,16 +74,19 @@ class Expert:
         store.answer([Demonstration(q.id, s.id, self.name) for q, s in zip(queries, shown, strict=True)])
 
     def _show(self, store: Store[Segment], rng: np.random.Generator) -> None:
-        if not self.settings.episodes or self._has_shown(store):
+        missing = self.settings.episodes - self._already(store)
+        if missing <= 0:
             return
-        queries = [Query((one,)) for one in play(self.task, self.advice, self.settings, rng)]
+        played = play(self.task, self.advice, missing, rng, self.settings)
+        queries = [Query((one,)) for one in played]
         store.ask(queries)
         # In the same order, so that a round that was killed in between, and is done again, goes on from there.
         store.answer([Demonstration(q.id, q.candidates[0].id, self.name) for q in queries])
 
-    def _has_shown(self, store: Store[Segment]) -> bool:
-        own = (d.demonstration for d in store.demonstrations() if d.like.id == d.query.candidates[0].id)
-        return any(one.labeler == self.name for one in own)
+    def _already(self, store: Store[Segment]) -> int:
+        """How many episodes of its own are there; a correction may be what the learner did."""
+        shown = (one.like for one in store.demonstrations() if one.demonstration.labeler == self.name)
+        return sum(one.episode.startswith(f"{self.name}/") for one in shown)
 
     def _corrected(self, query: Query[Segment]) -> Segment:
         """The same states, with the expert's actions. Nothing is known of what they would have led to."""
@@ -102,12 +109,20 @@ def advice_of(policy: Path | None, task: ControlTask) -> Advice:
             f"labeler.policy: no expert is known for {task.name}, only for {', '.join(EXPERTS)}: name a run of control "
             "or a zip of stable-baselines3"
         )
-    return EXPERTS[task.name]
+    size, advice = EXPERTS[task.name]
+    if task.observation_size != size:
+        raise ConfigError(
+            f"labeler.policy: the known expert for {task.name} sees all {size} numbers of an observation, and here "
+            f"there are {task.observation_size} (task.hide, task.stack): name a run of control or a zip that acts on "
+            "these"
+        )
+    return advice
 
 
-def play(task: ControlTask, advice: Advice, settings: ExpertSettings, rng: np.random.Generator) -> Sequence[Segment]:
+def play(
+    task: ControlTask, advice: Advice, episodes: int, rng: np.random.Generator, settings: ExpertSettings
+) -> Sequence[Segment]:
     """Whole episodes in which the expert acts, with noise, and which hold what it would have done without."""
-    episodes = settings.episodes
     noise = np.random.default_rng(rng.integers(2**63))
 
     def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
@@ -128,6 +143,8 @@ def _disturbed(actions: Floats, task: ControlTask, width: float, rng: np.random.
         drawn = np.eye(task.action_size, dtype=np.float32)[rng.integers(task.action_size, size=len(actions))]
         return np.where(rng.random((len(actions), 1)) < width, drawn, actions)
     low, high = task.action_bounds
-    noisy = actions + width * (high - low) / 2 * rng.standard_normal(actions.shape)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    half = np.where(bounded, (np.where(bounded, high, 1) - np.where(bounded, low, -1)) / 2, 1)  # what has no bounds: 1
+    noisy = actions + width * half * rng.standard_normal(actions.shape)
     found: Floats = np.clip(noisy, low, high).astype(np.float32)
     return found

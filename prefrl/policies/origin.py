@@ -25,6 +25,8 @@ class _Found(NamedTuple):
     state: State
     bounds: Bounds | None
     squash: bool
+    env: str = ""
+    """Of a run, the task that it is for; a zip does not say."""
 
 
 def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings) -> State:
@@ -46,6 +48,10 @@ def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
     Raises `ConfigError` as `starting_state` does.
     """
     found = _found(path, who)
+    if found.env not in ("", task.name):
+        raise ConfigError(
+            f"{who}: expected who knows {task.name}, and {path} is a run of {found.env}: name another one"
+        )
     _check_spaces(found, path, task, who)
     parameters: Mapping[str, Tensor] = found.state["parameters"]
     actor, critic = (tuple(_sizes(parameters, net)[1:-1]) for net in ("actor", "critic"))
@@ -83,7 +89,7 @@ def _of_run(folder: Path) -> _Found:
         raise ConfigError(f"{folder} holds no policy of control that can be taken over; expected {OURS}")
     task, squash = task_of(said), squashes(said["learner"])
     space = ActionSpace.within(task.action_size, task.action_bounds, squash)
-    return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash)
+    return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash, task.name)
 
 
 def task_of(said: Json) -> ControlTask:

@@ -81,6 +81,13 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
     )
 
 
+def piece(one: Segment, start: int, length: int) -> Segment:
+    """Some steps of a segment, with their states and gold."""
+    part = slice(start, start + length)
+    states, gold = (None if x is None else x[part] for x in (one.states, one.gold))
+    return Segment(one.observations[part], one.actions[part], one.episode, one.start + start, states, gold)
+
+
 def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.random.Generator) -> Rollout:
     """What a starting policy does: `count` windows in count * segment_steps / OVERLAP steps, or in more.
 

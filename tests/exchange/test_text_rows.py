@@ -190,7 +190,7 @@ def test_a_completion_without_a_label_is_a_demonstration_and_is_written_so(
     tmp_path: Path, text_store: Store[Response]
 ) -> None:
     rows: list[Mapping[str, Any]] = [
-        {"prompt": "p", "completion": "c"},
+        {"prompt": "p", "completion": "c", "weight": 2.0},
         {"prompt": [Q], "completion": [YES], "labeler": "ann"},
     ]
     assert import_judgements(lines(tmp_path / "in.jsonl", *rows), text_store).read == 2
@@ -200,11 +200,18 @@ def test_a_completion_without_a_label_is_a_demonstration_and_is_written_so(
     done = export(text_store, tmp_path / "out.jsonl", "demonstrations")
     written = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     assert [(row["prompt"], row["completion"]) for row in written] == shown
-    assert (done.written, done.dropped["annotator's name"]) == (2, 2)
+    assert [row.get("weight", 1.0) for row in written] == [2.0, 1.0]
+    assert (done.written, done.dropped) == (2, {"annotator's name": 2, "time of an answer": 2})
     dropped = export(text_store, tmp_path / "pairs.jsonl", "preferences").dropped
     assert dropped["demonstration"] == 2
 
 
-def test_a_label_that_says_nothing_makes_no_demonstration_of_a_row() -> None:
+@pytest.mark.parametrize("label", [{"label": None}, {"good": False}, {"Label": True}])
+def test_a_row_with_what_may_be_a_label_is_no_demonstration(label: Mapping[str, Any]) -> None:
     with pytest.raises(ValueError, match="column 'label': expected true or false"):
-        one({"prompt": "p", "completion": "c", "label": None})
+        one({"prompt": "p", "completion": "c", **label})
+
+
+def test_an_empty_demonstration_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected what a good response is like, got an empty text"):
+        one({"prompt": "p", "completion": ""})

@@ -545,3 +545,23 @@ def test_what_was_shown_counts_by_its_weight_and_that_of_the_fit() -> None:
     assert (found.judgement.weight, found.judgement.labeler) == (1.0, "ann")
     assert found.judgement.preference == float(found.query.candidates[0].id == like.id)
     assert Demonstrated(query, own, Demonstration(query.id, own.id)).implied(1.0) is None
+
+
+def test_only_the_newest_answers_count_where_that_is_said(
+    tmp_path: Path, judged: list[Judged[Segment]], make_segment: Callable[..., Segment]
+) -> None:
+    with Store[Segment](tmp_path) as store:
+        store.ask([one.query for one in judged[:30]])
+        store.answer([one.judgement for one in judged[:30]])
+        own = [make_segment() for _ in range(6)]
+        queries = [Query((one,)) for one in own]
+        store.ask(queries)
+        store.keep([make_segment()])
+        like = make_segment()
+        store.keep([like])
+        store.answer([Demonstration(query.id, like.id) for query in queries])
+        few = FittingSettings(epochs=1, newest=4)
+        metrics = fit(model(), store, few, np.random.default_rng(0)).metrics
+        assert (metrics["judgements"], metrics["shown"]) == (8, 4)
+        every = fit(model(), store, FittingSettings(epochs=1), np.random.default_rng(0)).metrics
+        assert (every["judgements"], every["shown"]) == (36, 6)

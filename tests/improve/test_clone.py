@@ -13,10 +13,11 @@ import torch
 from control_stubs import Known, point
 
 from prefrl.envs.control import GymnasiumTask
+from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
 from prefrl.improve.control import ControlLearnerSettings
 from prefrl.improve.offline import Offline, Recordings
-from prefrl.judgements import Demonstration
+from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.expert import Advice, Expert, ExpertSettings
 from prefrl.protocols import Store as Kept
 from prefrl.store import Store
@@ -244,3 +245,21 @@ def test_what_is_asked_about_is_the_learners_own_behaviour_whatever_file_it_clon
     assert one.imitates(cast(Any, None))
     asked = one.sample(3, np.random.default_rng(0))
     assert all(segment.episode.startswith("round 0") for segment in asked)
+
+
+def test_only_what_was_shown_is_cloned_and_not_what_was_judged(tmp_path: Path) -> None:
+    """Judged segments may be the worst ones; and of a correction the expert's actions are read, also from a folder."""
+    seen = np.linspace(-1, 1, 20, dtype=np.float32)[:, None]
+    own = Segment(seen, -to_the_middle(seen), "own", 0)
+    like = replace(own, actions=to_the_middle(seen))
+    worse = Segment(seen, -to_the_middle(seen), "worse", 0)
+    with Store[Segment](tmp_path) as store:
+        queries = [Query((own,)), Query((own, worse))]
+        store.ask(queries)
+        store.keep([like])
+        store.answer([Demonstration(queries[0].id, like.id, "ann"), Comparison(queries[1].id, 1.0, "ann")])
+        one = learner(point(), cloning_epochs=200)
+        assert one.improve(cast(Any, Known()), store, np.random.default_rng(0))["demonstrations"] == 1
+    (recorded,) = recording(tmp_path).segments
+    np.testing.assert_array_equal(recorded.actions, like.actions)
+    assert np.abs(one.actor()(seen, None, None)[0] - like.actions).mean() < 0.2

@@ -98,3 +98,12 @@ def test_rows_become_queries() -> None:
     pool = responses("a", 3)
     (query,) = asked(pool, np.array([[2, 0]]))
     assert set(query.candidates) == {pool[0], pool[2]}
+
+
+def test_of_single_segments_none_is_asked_about_twice(rng: np.random.Generator) -> None:
+    """Whoever shows what to do in a state has shown it."""
+    seen, done = np.zeros((10, 1), np.float32), np.zeros((10, 1), np.float32)
+    pool = [Segment(seen, done, f"e{e}", start) for e in range(2) for start in range(0, 41, 2)]
+    chosen = [pool[i] for (i,) in groups(pool, 1, rng)]
+    assert len(chosen) >= 4
+    assert not any(overlap(a, b) for a, b in combinations(chosen, 2))

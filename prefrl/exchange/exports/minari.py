@@ -52,7 +52,9 @@ def export_minari(store: Store, path: Path) -> Exported:
             tally.dropped[STATES] += segment.states is not None
         written = write_lines(work / LABELS, _labels(store, tally, episodes))
         if storage is None:
-            raise StoreError(f"{store.folder} holds no answer to write")
+            raise StoreError(
+                f"{store.folder} holds no judgement of segments to write; demonstrations fit --form bundle"
+            )
     return tally.done(store, written, f"{len(episodes)} segments as episodes", *NOTES)
 
 

@@ -35,6 +35,8 @@ from prefrl.types import Json, Response
 BOTH = "tie written both ways"
 MIDDLE = "response that is neither better than all others nor worse"
 ALONE = "rating of a single response"
+OPINION = "judgement or skip"
+ANSWERED = "response that a demonstration answers"
 UNTOLD = "prompt that is no transcript, written as one message of a user"
 
 
@@ -148,15 +150,25 @@ def _unpaired(store: Store, tally: Tally, say: Conversations) -> Iterator[Json]:
 
 
 def export_demonstrations(store: Store, path: Path) -> Exported:
-    """Write one JSON object a line with `prompt` and `completion`: every response that was shown.
+    """Write one JSON object a line with `prompt` and `completion`, and a `weight` other than 1: what was shown.
 
     Raises `StoreError` for demonstrations of control.
     """
+    opinions = 0
+    for given in each_answer(store):
+        refuse_segments(given, "demonstrations")
+        opinions += 1
     shown = store.demonstrations()
     error = StoreError("demonstrations of control segments do not fit JSON lines; use --form bundle")
     texts = only(Response, [one.like for one in shown], error)
-    rows = ({"prompt": text.prompt, "completion": text.text} for text in texts)
-    return Exported(write_lines(path, rows), {name: len(shown) for name in (LABELER, TIME) if shown})
+    weights = [one.demonstration.weight for one in shown]
+    rows = (
+        {"prompt": text.prompt, "completion": text.text} | ({} if weight == 1.0 else {"weight": weight})
+        for text, weight in zip(texts, weights, strict=True)
+    )
+    left = {LABELER: len(shown), TIME: len(shown), OPINION: opinions}
+    left[ANSWERED] = sum(one.like.id != one.query.candidates[0].id for one in shown)
+    return Exported(write_lines(path, rows), {name: count for name, count in left.items() if count})
 
 
 def export_judgements(store: Store, path: Path) -> Exported:

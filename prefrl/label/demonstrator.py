@@ -1,0 +1,81 @@
+"""Demonstrations that judge: a piece of what was shown is better than each piece of the learner's own.
+
+Variant: imitation by an adversary (GAIL, Ho and Ermon 2016) with the likelihood of preferences in place of the
+discriminator's, in the loop that is there: the reward is fitted on "shown is better than own", the policy gets better
+at it, and its newer behaviour is asked about again. With `fitting.newest` only the newest answers count, as an
+adversary's do; without it this is near maximum entropy inverse reinforcement learning (Ziebart et al. 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from prefrl.components import ConfigError, Settings
+from prefrl.exchange.recordings import recording
+from prefrl.judgements import Demonstration
+from prefrl.kinds import kind_of
+from prefrl.protocols import ControlTask, Store, Task, control
+from prefrl.sample.segments import piece
+from prefrl.types import Query, Segment
+
+
+class DemonstratorSettings(Settings):
+    """Answer each segment of the learner's own with a piece of recorded demonstrations, whatever it is."""
+
+    kind: Literal["demonstrator"] = "demonstrator"
+    name: str = Field("demonstrator", min_length=1)
+    """Who answers; kept with every answer."""
+    data: Path | None = None
+    """What was shown: a folder of demonstrations, an .npz file of segments, or a Minari data set. It has to be named."""
+
+    def build(self, task: Task) -> Demonstrator:
+        found = control(task, f"labeler kind {self.kind!r} answers about segments of control")
+        if self.data is None:
+            raise ConfigError("labeler.data: missing; name a folder of demonstrations, made by prefrl demonstrate, say")
+        return Demonstrator(self.name, shown(self.data, found))
+
+
+def shown(path: Path, task: ControlTask) -> Sequence[Segment]:
+    """The recorded demonstrations. Raises `ConfigError` where they do not fit the task."""
+    try:
+        segments = recording(path).segments
+    except ValueError as error:
+        raise ConfigError(f"labeler.data: {error}") from error
+    for one in segments:
+        if fault := kind_of(one).misfit(one, task) or kind_of(one).fault(one):
+            raise ConfigError(f"labeler.data: the demonstration {one.episode!r} of {path} {fault}: choose another one")
+    if max(map(len, segments)) < task.segment_steps:
+        raise ConfigError(
+            f"labeler.data: no demonstration of {path} has task.segment_steps={task.segment_steps} steps: make them "
+            "shorter, or choose another one"
+        )
+    return segments
+
+
+@dataclass(frozen=True)
+class Demonstrator:
+    """A `Labeler` of segments that knows what was shown."""
+
+    name: str
+    shown: Sequence[Segment]
+    demonstrates: bool = True
+
+    def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
+        """Answer every open query with a random piece of the same length."""
+        queries = store.open_queries(self.name)
+        likes = [self._like(query, rng) for query in queries]
+        store.keep(likes)
+        store.answer([Demonstration(q.id, like.id, self.name) for q, like in zip(queries, likes, strict=True)])
+
+    def _like(self, query: Query[Segment], rng: np.random.Generator) -> Segment:
+        length = len(query.candidates[0])
+        starts = np.array([max(0, len(one) - length + 1) for one in self.shown])
+        at = int(rng.integers(starts.sum()))  # each piece is as probable as any other
+        which = int(np.searchsorted(starts.cumsum(), at, side="right"))
+        return piece(self.shown[which], at - int(starts[:which].sum()), length)
