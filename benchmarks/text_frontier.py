@@ -123,7 +123,7 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     draw(world, rows).savefig(to.with_suffix(".svg"))
-    ends = {name: ends_of(world, rows, name) for name in world.runs}
+    ends = {name: ends_of(world, rows, name) for name in asked if name != BEST}
     found = {"name": f"text_frontier: {options.task}", "unit": "gold, KL"}
     print(json.dumps(found | {"ends": ends, "short": options.short}))
 
@@ -187,7 +187,7 @@ def draw(world: World, rows: list[dict[str, Any]]) -> Figure:
         ax.set(xlabel="KL to the start, nats a response", ylabel=label, ylim=(0, 1))
         ax.grid(color="0.9")
         ax.spines[["top", "right"]].set_visible(False)
-        for name in (BEST, *world.runs):
+        for name in (name for name in (BEST, *world.runs) if any(r["learner"] == name for r in rows)):
             kl, value = over_rounds(rows, name, measure)
             style = {"color": "0.3", "linestyle": "--", "linewidth": 2} if name == BEST else {"marker": "o"}
             ax.plot(kl, value, label=name, markersize=4, **style)

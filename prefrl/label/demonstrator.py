@@ -32,7 +32,7 @@ class DemonstratorSettings(Settings):
     name: str = Field("demonstrator", min_length=1)
     """Who answers; kept with every answer."""
     data: Path | None = None
-    """What was shown: a folder of demonstrations, an .npz file of segments, or a Minari data set. It has to be named."""
+    """What was shown: a folder of demonstrations, an .npz file of segments, or a Minari data set. To be named."""
 
     def build(self, task: Task) -> Demonstrator:
         found = control(task, f"labeler kind {self.kind!r} answers about segments of control")
