@@ -230,7 +230,7 @@ class Offline:
         if self.policy.normaliser.count and not self._settings.imitates:
             return {}
         if new := segments[self._seen :]:
-            for one in new:
+            for one in new if self._settings.imitates else ():
                 _check_shown(one, self._task)
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
