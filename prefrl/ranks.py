@@ -130,7 +130,8 @@ def shared(loop: Loop[C]) -> Loop[C]:
     if isinstance(loop.learner, Divides):
         loop.learner.check_ranks(size)
         return replace(loop, fit=fit_once)
-    text(loop.task, f"{size} ranks can share learners of text, and of control learner.kind=control alone")
+    name = type(loop.learner).__name__
+    text(loop.task, f"{size} ranks can share the learner {name} on text alone (of control, learner.kind=control)")
     return loop
 
 

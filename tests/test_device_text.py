@@ -16,7 +16,7 @@ from prefrl.components import settings_class
 from prefrl.envs.texts import Texts, TextsSettings
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit_judged
-from prefrl.judgements import Comparison, Judged
+from prefrl.judgements import Comparison, Demonstrated, Judged
 from prefrl.reward_models.backbone import Backbone
 from prefrl.reward_models.text import TransformerReward, TransformerSettings
 from prefrl.types import Query, Response
@@ -52,6 +52,9 @@ def judged(count: int = 8) -> list[Judged[Response]]:
 
 class Answers:
     """A store that holds judgements, and nothing else."""
+
+    def demonstrations(self) -> list[Demonstrated[Response]]:
+        return []
 
     def judged(self) -> list[Judged[Response]]:
         return judged(4)
