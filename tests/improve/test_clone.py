@@ -12,6 +12,7 @@ import pytest
 import torch
 from control_stubs import Known, point
 
+from prefrl import Config, Run, load_policy
 from prefrl.envs.control import GymnasiumTask
 from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
@@ -192,21 +193,21 @@ def test_a_learned_std_narrows_where_the_expert_is_sure(tmp_path: Path) -> None:
 
 def test_a_learner_that_starts_from_a_clone_keeps_what_it_does_whatever_it_sees(tmp_path: Path) -> None:
     """One rollout without a gradient step once turned a good clone into a bad policy."""
-    task = point()
-    one = learner(task)
-    one.improve(cast(Any, Known()), shown(tmp_path, task, to_the_middle, episodes=4), np.random.default_rng(0))
-    one.save(tmp_path / "clone.zip")
-    policy = {"hidden": [16], "initial_std": 0.7}
-    start = ControlLearnerSettings.model_validate({"start": tmp_path / "clone.zip", "policy": policy})
+    small = ["learner.cloning_epochs=1", "learner.hidden=[8]", "labeler.episodes=1", "learner.evaluation_episodes=1"]
+    with Run(Config.load("control/pendulum-demos", small), tmp_path / "clone") as run:
+        list(run)
+    policy = {"hidden": [8], "initial_std": 0.7}
+    start = ControlLearnerSettings.model_validate({"start": tmp_path / "clone", "policy": policy})
+    task = cast(GymnasiumTask, run.loop.task)
+    seen = np.random.default_rng(0).normal(0.0, 1.0, (20, 3)).astype(np.float32)
+    expected, _ = load_policy(tmp_path / "clone").predict(seen)
     other = start.build(task, np.random.default_rng(0))
-    seen = np.linspace(-1, 1, 21, dtype=np.float32)[:, None]
-    expected, _ = one.actor()(seen, None, None)
     np.testing.assert_allclose(other.actor()(seen, None, None)[0], expected, atol=1e-5)
-    other.policy.observe(np.random.default_rng(0).normal(5.0, 30.0, (500, 1)).astype(np.float32))
+    other.policy.observe(np.random.default_rng(0).normal(5.0, 30.0, (5000, 3)).astype(np.float32))
     np.testing.assert_allclose(other.actor()(seen, None, None)[0], expected, atol=1e-5)
     again = start.build(task, np.random.default_rng(1))
     again.load(other.state())  # nor after a resumption
-    again.policy.observe(np.full((500, 1), 9.0, np.float32))
+    again.policy.observe(np.full((5000, 3), 90.0, np.float32))
     np.testing.assert_allclose(again.actor()(seen, None, None)[0], expected, atol=1e-5)
 
 
