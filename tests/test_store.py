@@ -196,13 +196,18 @@ def opened_soon(folder: Path) -> Store[Response]:
     return Store[Response](folder)
 
 
+def check_rebuilt(store: Store[Response]) -> None:
+    """The derived tables are the same when they are written again from the log."""
+    before = derived(store.folder)
+    with store.log.transaction() as tx:
+        rebuild(tx.connection)
+    with store.log.reading() as connection:
+        assert list(dump(connection)) == before
+
+
 def test_derived_tables_are_the_same_when_written_again(text_store: Store[Response]) -> None:
     fill(text_store)
-    before = derived(text_store.folder)
-    with text_store.log.transaction() as tx:
-        rebuild(tx.connection)
-    with text_store.log.reading() as connection:
-        assert list(dump(connection)) == before
+    check_rebuilt(text_store)
 
 
 def test_a_transaction_that_fails_leaves_nothing(text_store: Store[Response]) -> None:
@@ -272,11 +277,7 @@ def test_demonstrations_come_back_with_what_they_show_and_close_their_queries(te
     assert text_store.counts() == {"asked": 3, "answered": 2, "skipped": 0}
     text_store.retract(asked[0].id, "ann")
     assert [one.like.id for one in text_store.demonstrations()] == [itself.id]
-    before = derived(text_store.folder)
-    with text_store.log.transaction() as tx:
-        rebuild(tx.connection)
-    with text_store.log.reading() as connection:
-        assert list(dump(connection)) == before
+    check_rebuilt(text_store)
 
 
 def test_a_demonstration_of_what_is_not_here_or_of_another_prompt_is_refused(text_store: Store[Response]) -> None:

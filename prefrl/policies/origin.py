@@ -50,7 +50,7 @@ def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
     found = _found(path, who)
     if found.env not in ("", task.name):
         raise ConfigError(
-            f"{who}: expected who knows {task.name}, and {path} is a run of {found.env}: name another one"
+            f"{who}: expected an expert for {task.name}, and {path} is a run of {found.env}: name another one"
         )
     _check_spaces(found, path, task, who)
     parameters: Mapping[str, Tensor] = found.state["parameters"]

@@ -137,7 +137,7 @@ def test_an_experts_zip_acts_as_it_does_and_a_run_of_another_task_is_refused(
     seen = some().observations
     advice = expert(pendulum, policy=tmp_path / "expert.zip").advice
     np.testing.assert_allclose(advice(seen), learner.actor()(seen, None, None)[0], atol=1e-5)
-    with pytest.raises(ConfigError, match=r"labeler\.policy: expected who knows Pendulum-v1, and .* is a run of"):
+    with pytest.raises(ConfigError, match=r"labeler\.policy: expected an expert for Pendulum-v1, and .* is a run of"):
         expert(pendulum, policy=finished_tiny["control/toy"])
 
 
