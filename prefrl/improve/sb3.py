@@ -34,7 +34,9 @@ from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
 from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
 
-Name: TypeAlias = Literal["PPO", "A2C", "TRPO", "RecurrentPPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN", "QRDQN"]
+Name: TypeAlias = Literal[
+    "PPO", "A2C", "TRPO", "RecurrentPPO", "SAC", "TD3", "DDPG", "TQC", "CrossQ", "DQN", "DoubleDQN", "QRDQN"
+]
 
 
 class Algorithm(NamedTuple):
@@ -70,6 +72,7 @@ ALGORITHMS: dict[Name, Algorithm] = {
     "TQC": Algorithm("sb3_contrib", 1),
     "CrossQ": Algorithm("sb3_contrib", 1),
     "DQN": Algorithm("stable_baselines3", 4, actions="discrete", draws=False),
+    "DoubleDQN": Algorithm("prefrl.improve.double_dqn", 4, actions="discrete", draws=False),
     "QRDQN": Algorithm("sb3_contrib", 4, actions="discrete", draws=False),
 }
 OF_TASK = {"any": "any actions", "box": "continuous actions", "discrete": "discrete actions"}
@@ -85,8 +88,8 @@ class SB3Settings(Settings):
 
     kind: Literal["sb3"] = "sb3"
     algorithm: Name = "PPO"
-    """Which one; DQN and QRDQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the others for
-    both. RecurrentPPO remembers."""
+    """Which one; DQN, DoubleDQN and QRDQN for discrete actions, SAC, TD3, DDPG, TQC and CrossQ for continuous ones, the
+    others for both. RecurrentPPO remembers."""
     environments: int = Field(8, ge=1)
     """How many are stepped side by side."""
     steps_per_round: int = Field(8192, ge=1)

@@ -401,7 +401,7 @@ def test_exploration_falls_over_the_run_and_not_in_each_round_anew(store: Store[
     assert other.model.exploration_rate == rates[-1]
 
 
-@pytest.mark.parametrize("name", ["DQN", "QRDQN", "TD3", "DDPG"])
+@pytest.mark.parametrize("name", ["DQN", "DoubleDQN", "QRDQN", "TD3", "DDPG"])
 def test_where_a_policy_draws_nothing_first_questions_are_about_random_actions(name: Name) -> None:
     pool = _learner(_task(name), _settings(name)).sample(20, np.random.default_rng(0))
     actions = np.concatenate([s.actions for s in pool])
