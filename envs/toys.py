@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.fast.vectorised import Vectorised
-from prefrl.protocols import Environments
+from prefrl.protocols import Dynamics, Environments
 from prefrl.types import Bools, Floats, Segment
 
 REACH = 1.5
 """How far from the middle the picture shows."""
 INK, MARK = (34, 87, 150), (214, 116, 30)
+
+
+class Drawn(Dynamics, Protocol):
+    """A world of which each state can be drawn."""
+
+    def picture(self, state: Floats, size: int) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -131,13 +137,13 @@ class PointSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class ToyTask:
-    """A `prefrl.protocols.ControlTask` of a world in this file.
+    """A `prefrl.protocols.ControlTask` of a small world that draws itself.
 
     Raises `ConfigError` for segments that are longer than an episode.
     """
 
     name: str
-    world: Point | TMaze
+    world: Drawn
     horizon: int
     segment_steps: int
     frame_size: int

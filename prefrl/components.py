@@ -71,6 +71,7 @@ class Settings(BaseModel):
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {
         "control": "prefrl.envs.control:ControlSettings",
+        "gridworld": "prefrl.envs.tabular:GridworldSettings",
         "imdb": "prefrl.envs.imdb:IMDBSettings",
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
@@ -104,6 +105,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
+        "q_learning": "prefrl.improve.q_learning:QLearningSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
         "sft": "prefrl.improve.sft:SFTSettings",
