@@ -60,20 +60,20 @@ class ActionShowing:
         if self.bounds is None:
             return self._choice(step, row)
         if len(row) != self.size:
-            raise Refused(422, f"step {step}: an action has {self.size} numbers, got {len(row)}")
+            raise Refused(422, f"step {step + 1}: an action has {self.size} numbers, got {len(row)}")
         with np.errstate(over="ignore"):  # what is too large for a float32 becomes infinite, and is refused
             action: Floats = np.asarray(row, np.float32)
         low, high = self.bounds
         if not np.isfinite(action).all() or (action < low).any() or (action > high).any():
             wrong = int(np.argmax(~np.isfinite(action) | (action < low) | (action > high)))
-            span = f"{low[wrong]:g} to {high[wrong]:g}"
-            raise Refused(422, f"step {step}: expected a number from {span} in dimension {wrong}, got {row[wrong]:g}")
+            span = f"{low[wrong]:g} to {high[wrong]:g} in dimension {wrong + 1}"
+            raise Refused(422, f"step {step + 1}: expected a number from {span}, got {row[wrong]:g}")
         return action
 
     def _choice(self, step: int, row: Sequence[float]) -> Floats:
         if len(row) != 1 or row[0] not in range(self.size):
             got = f"{row[0]:g}" if len(row) == 1 else f"{len(row)} numbers"
-            raise Refused(422, f"step {step}: expected the number of an action, 0 to {self.size - 1}, got {got}")
+            raise Refused(422, f"step {step + 1}: expected the number of an action, 0 to {self.size - 1}, got {got}")
         chosen: Floats = np.eye(self.size, dtype=np.float32)[int(row[0])]
         return chosen
 

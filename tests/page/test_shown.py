@@ -114,8 +114,8 @@ REST: list[Any] = [None, None, None]
     [
         (BOX, [[0.0, 1.0]], "4 steps"),
         (BOX, [None] * (STEPS + 1), "4 steps"),
-        (BOX, [[0.0, 1.0001], *REST], "step 0: expected a number from -1 to 1 in dimension 1, got 1.0001"),
-        (BOX, [*REST, [-1e300, 0.0]], "step 3: expected a number from -1 to 1 in dimension 0"),
+        (BOX, [[0.0, 1.0001], *REST], "step 1: expected a number from -1 to 1 in dimension 2, got 1.0001"),
+        (BOX, [*REST, [-1e300, 0.0]], "step 4: expected a number from -1 to 1 in dimension 1"),
         (BOX, [[0.0], *REST], "an action has 2 numbers, got 1"),
         (BOX, [[], *REST], "at least 1"),
         (BOX, [["0.5", 0.0], *REST], "valid number"),

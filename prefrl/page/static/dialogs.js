@@ -25,6 +25,7 @@ const GROUPS = {
     "undo",
   ],
   "help.ranking": ["up", "down", "level", "submit"],
+  "help.showing": ["stepBack", "stepOn", "more", "less", "most", "least", "own", "clear", "write"],
   "help.player": ["play", "replay", "back", "forward", "slower", "faster"],
   "help.page": ["written", "comment", "guideline", "help"],
 };
