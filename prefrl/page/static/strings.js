@@ -176,6 +176,7 @@ const ENGLISH = {
   "help.answers": "Answers",
   "help.ranking": "Rankings",
   "help.showing": "Showing what to do",
+  "help.writing": "Writing",
   "help.player": "Clips",
   "help.page": "Page",
   "help.change": "Change keys…",
