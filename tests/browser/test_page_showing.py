@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser.child import Child, free_port, serve_command
-from browser.house import POINT, STEPS, House, Open, fill, segment
+from browser.house import CONFIG, POINT, STEPS, House, Open, fill, segment
 from browser.visitor import LOST, Visit, Visitor
 from playwright.sync_api import Browser, expect
 
+from prefrl.envs.toys import TMazeSettings
 from prefrl.improve.clone import CloneSettings
 from prefrl.page.shown import TextShowing
 from prefrl.reward_models.mlp import MLPSettings
@@ -156,6 +157,27 @@ def test_the_mouse_does_what_the_keys_do_and_a_reload_keeps_what_was_begun(clip_
     (one,) = clip_house.store.demonstrations()
     assert one.like.actions.tolist() == [[0.0, 0.5]] * 10 + [[0.0, 0.0]] * 5
     assert clip_house.about()[0]["input"] == "mouse"
+
+
+def test_numbers_choose_discrete_actions_by_their_names(
+    tmp_path: Path, open_house: Open, visit: Visit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maze = TMazeSettings(length=4)
+    states = np.array([[place, 1.0, 0.0, place] for place in range(4)])
+    own = Segment(np.zeros((4, 2), np.float32), np.eye(3, dtype=np.float32)[[0, 1, 0, 1]], "e", 0, states)
+    folder = fill(tmp_path / "maze", [Query((own,))])
+    (folder / "config.yaml").write_text(CONFIG.replace(f"point, segment_steps: {STEPS}", "tmaze, length: 4"))
+    monkeypatch.setattr("browser.house.POINT", maze)
+    ann = visit(open_house(folder, kind="control", ask="action").link("ann"), reduced_motion="reduce")
+    id = ann.question()
+    expect(ann.test("move-1")).to_contain_text("left")
+    expect(ann.test("move-0")).to_have_class("move policys")
+    keys(ann, "1", "ArrowRight", "ArrowRight", "ArrowRight", "3", "ArrowUp", "ArrowDown", "Enter")
+    ann.gone(id)
+    ann.saved()
+    with Store[Segment](folder, write=False) as store:
+        (one,) = store.demonstrations()
+    assert one.like.actions.argmax(1).tolist() == [0, 0, 0, 2]
 
 
 @pytest.fixture
