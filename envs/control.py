@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -37,6 +37,25 @@ WORLDS: dict[str, Callable[[bool], Dynamics]] = {
     "MountainCarContinuous-v0": MountainCarContinuous,
 }
 """Environments whose equations are here, by whether episodes may end early."""
+
+
+ACTION_NAMES: dict[str, tuple[str, ...]] = {
+    "Pendulum-v1": ("torque",),
+    "CartPole-v0": ("push left", "push right"),
+    "CartPole-v1": ("push left", "push right"),
+    "Acrobot-v1": ("torque -1", "no torque", "torque +1"),
+    "MountainCar-v0": ("accelerate left", "coast", "accelerate right"),
+    "MountainCarContinuous-v0": ("acceleration",),
+    "LunarLander-v3": ("coast", "left engine", "main engine", "right engine"),
+    "Reacher-v5": ("shoulder", "elbow"),
+    "Swimmer-v5": ("first joint", "second joint"),
+    "InvertedPendulum-v5": ("force",),
+    "InvertedDoublePendulum-v5": ("force",),
+    "Hopper-v5": ("thigh", "leg", "foot"),
+    "HalfCheetah-v5": ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"),
+    "Walker2d-v5": ("right thigh", "right leg", "right foot", "left thigh", "left leg", "left foot"),
+}
+"""What can be done, in words: discrete actions, or the dimensions of others."""
 
 
 class ControlSettings(Settings):
@@ -224,6 +243,11 @@ class GymnasiumTask:
     @property
     def kind(self) -> str:
         return "control"
+
+    @property
+    def action_names(self) -> Sequence[str]:
+        known = ACTION_NAMES.get(self.name, ())
+        return known if len(known) == self.action_size else ()
 
     def environments(self, count: int) -> Environments:
         return self.make(count)

@@ -15,6 +15,7 @@ from prefrl.types import Bools, Floats, Segment
 
 REACH = 1.5
 """How far from the middle the picture shows."""
+TURNS = ("on", "left", "right")
 INK, MARK = (34, 87, 150), (214, 116, 30)
 
 
@@ -59,7 +60,7 @@ class TMaze:
     junction for the last of `length` steps. The gold is 1 for the right arm, and minus 1 / `length` for each step that
     does not lead on. So who remembers gets 1, and who does not can get 0.5 on average.
 
-    A state is (place, side of the right arm, arm that was taken, age); actions are on, left, right.
+    A state is (place, side of the right arm, arm that was taken, age); actions are `TURNS`.
     """
 
     length: int
@@ -115,7 +116,8 @@ class TMazeSettings(Settings):
 
     def build(self) -> ToyTask:
         steps = self.segment_steps or self.length
-        return ToyTask("tmaze", TMaze(self.length), self.length, steps, self.frame_size, action_size=3, fps=5.0)
+        parts = "tmaze", TMaze(self.length), self.length, steps, self.frame_size
+        return ToyTask(*parts, action_size=3, fps=5.0, action_names=TURNS)
 
 
 class PointSettings(Settings):
@@ -132,7 +134,7 @@ class PointSettings(Settings):
     def build(self) -> ToyTask:
         bounds = -np.ones(2, np.float32), np.ones(2, np.float32)
         parts = "point", Point(), self.horizon, self.segment_steps, self.frame_size
-        return ToyTask(*parts, action_size=2, fps=10.0, action_bounds=bounds)
+        return ToyTask(*parts, action_size=2, fps=10.0, action_bounds=bounds, action_names=("right", "up"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +153,7 @@ class ToyTask:
     fps: float
     action_bounds: tuple[Floats, Floats] | None = None
     observation_size: int = 2
+    action_names: tuple[str, ...] = ()
     kind: str = "control"
 
     def __post_init__(self) -> None:

@@ -172,7 +172,8 @@ class Config(Settings):
 
     def _check_labeler(self, labeler: Labeler, learner: Learner) -> None:
         """Raises `ConfigError` where the labeler cannot answer about so many candidates, or nobody learns from it."""
-        count, shows = cast(SelectorSettings, self.select).candidates, isinstance(labeler, Demonstrates)
+        count = cast(SelectorSettings, self.select).candidates
+        shows = isinstance(labeler, Demonstrates) and labeler.demonstrates
         if self.loop.labels and shows != (count == 1):
             says = "shows what to do in the states of one" if shows else "compares two or more"
             raise ConfigError(

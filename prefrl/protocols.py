@@ -169,6 +169,15 @@ class Recorded(Protocol):
         """All of them; the gold is attached where the file has it."""
 
 
+@runtime_checkable
+class NamesActions(Protocol):
+    """A task of control that has words for what can be done."""
+
+    @property
+    def action_names(self) -> Sequence[str]:
+        """Of discrete actions, or of the dimensions of others; none where there are no words."""
+
+
 class TextTask(Task, Protocol):
     """Prompts to be answered by a small language model."""
 
@@ -262,7 +271,7 @@ class Swapping(Protocol[C_contra]):
 
 @runtime_checkable
 class Demonstrates(Protocol):
-    """A labeler that answers with behaviours, and so is asked about one candidate at a time."""
+    """A labeler that may answer with behaviours, and then is asked about one candidate at a time."""
 
     @property
     def demonstrates(self) -> bool: ...

@@ -7,6 +7,7 @@ One process writes at a time, from any of its threads; any number may read while
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -19,7 +20,7 @@ from prefrl.judgements import Answer, Demonstrated, Demonstration, Judged, check
 from prefrl.storage.arrivals import Merged, check_arrivals
 from prefrl.storage.blobs import read_arrays, write_arrays
 from prefrl.storage.events import answer_body, answer_kind, describe, load_candidate, read_answer, write_candidate
-from prefrl.storage.log import EventLog, StoreError, Transaction, row
+from prefrl.storage.log import EventLog, StoreError, StoreFull, Transaction, row
 from prefrl.storage.projection import ANSWERS, CHUNK, JUDGEMENTS, bodies, chunks, words
 from prefrl.storage.tables import event, standing
 from prefrl.storage.tables import query as asked
@@ -109,6 +110,17 @@ class Store(Generic[C]):
     def put(self, tx: Transaction, answer: Answer, about: Json) -> int:
         """Add one answer in a transaction; returns its number."""
         return self.put_all(tx, [answer], about)[0]
+
+    def show(self, tx: Transaction, like: C, answer: Demonstration, about: Json) -> int:
+        """Add a behaviour and the demonstration that it is, in a transaction; returns the answer's number."""
+        try:
+            self._file_one(like)  # before its event, as in `ask`
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise StoreFull(f"the disk with {self.folder} is full: this was not stored, try again later") from error
+        tx.extend(_rows([like]))
+        return self.put(tx, answer, about)
 
     def retract(self, query: str, labeler: str) -> None:
         """Take a labeler's answer back; the log keeps both."""

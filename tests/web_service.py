@@ -16,6 +16,7 @@ from prefrl.page.app import create_app
 from prefrl.page.questions import Policy, Terms
 from prefrl.page.security import Buckets
 from prefrl.page.service import Service
+from prefrl.page.shown import Showing
 from prefrl.store import Store
 
 ORIGIN = "http://127.0.0.1:8900"
@@ -32,7 +33,7 @@ class Clock:
         return self.now
 
 
-def page(kind: Any = "control") -> api.Page:
+def page(kind: Any = "control", ask: api.Ask = "judge") -> api.Page:
     return api.Page(
         title="test",
         question="Which is better?",
@@ -42,13 +43,21 @@ def page(kind: Any = "control") -> api.Page:
         minimum_watched=0,
         break_minutes=30,
         ui_version="0",
+        ask=ask,
     )
 
 
 @contextmanager
-def serving(store: Store[Any], kind: Any = "control", fixed: bool = False, **policy: Any) -> Iterator[Service]:
+def serving(
+    store: Store[Any],
+    kind: Any = "control",
+    fixed: bool = False,
+    ask: api.Ask = "judge",
+    shows: Showing | None = None,
+    **policy: Any,
+) -> Iterator[Service]:
     """An open service with a clock of its own; how often somebody asks is not limited."""
-    terms = Terms(page(kind), Policy(**policy), STRENGTHS, fixed=fixed, rate=1e6, fps=10.0)
+    terms = Terms(page(kind, ask), Policy(**policy), STRENGTHS, fixed=fixed, rate=1e6, fps=10.0, shows=shows)
     service = Service(store, terms, clock=Clock())
     service.logins = Buckets(1e6, 1e6, service.clock)
     service.open()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from dataclasses import dataclass, field
@@ -15,11 +16,13 @@ from rich.console import Console
 from prefrl.components import ConfigError, Settings, missing
 from prefrl.kinds import named
 from prefrl.label.checks import pick_checks
-from prefrl.page import api, static_files
+from prefrl.page import api, records, static_files
+from prefrl.page.clips.encode import INSTALL, formats
 from prefrl.page.clips.queue import ClipSettings
 from prefrl.page.questions import Policy, Terms
-from prefrl.page.texts import default_guideline
-from prefrl.protocols import DrawnTask, Store, Task
+from prefrl.page.shown import ActionShowing, Showing, TextShowing
+from prefrl.page.texts import default_guideline, question_of
+from prefrl.protocols import ControlTask, DrawnTask, NamesActions, Store, Task, control, text
 from prefrl.types import C
 
 if TYPE_CHECKING:  # a run without people loads no web server
@@ -27,6 +30,8 @@ if TYPE_CHECKING:  # a run without people loads no web server
 
 TELL_SECONDS = 30.0
 """How often it is told how far people are."""
+SHOWING_SECONDS = 600.0
+"""After how long without a sign of life a question goes to somebody else, where people show what to do."""
 
 
 class Strengths(Settings):
@@ -44,6 +49,10 @@ class WebSettings(Settings):
     """Ask people in their browsers, while the run goes on."""
 
     kind: Literal["web"] = "web"
+    ask: api.Ask = "judge"
+    """What people do: judge candidates; say what should have been done at each step of a clip (action, for control); or
+    write a response anew (rewrite, for text). What they show is a demonstration: it takes select.candidates=1, and has
+    no check questions and no repeats."""
     name: str = "me"
     """Whose link is printed; this person is an admin, and can invite others on the page."""
     host: str = "127.0.0.1"
@@ -63,7 +72,8 @@ class WebSettings(Settings):
     enough: float = Field(0.5, gt=0, le=1)
     """The share of all questions asked so far that must be judged before a round goes on."""
     lease_seconds: float | None = Field(None, gt=0)
-    """After how long without a sign of life a question goes to somebody else (120 for clips, 600 for texts)."""
+    """After how long without a sign of life a question goes to somebody else (120 for clips, 600 for texts and for what
+    people show)."""
     strength: bool = True
     """Whether a preference can be slight, clear or much."""
     strengths: Strengths = Strengths()
@@ -74,7 +84,7 @@ class WebSettings(Settings):
     consent: str = ""
     """What people must agree to before their first question; who agreed to which version, and when, is kept."""
     question: str = ""
-    """What is asked, in one sentence; the goal of the run where it is left out, or "Which clip is better?"."""
+    """What is asked, in one sentence; where it is left out the goal of the run, if people judge, or one of our own."""
     check_share: float = Field(0.05, ge=0, le=0.5)
     """The share of questions with a clear answer, to find out whether a person looks. Nothing is learned from them."""
     check_warn: float = Field(0.8, ge=0, le=1)
@@ -129,10 +139,11 @@ class WebSettings(Settings):
         return True
 
     def asking(self, goal: str) -> Self:
-        return self if self.question else self.model_copy(update={"question": goal})
+        # A goal asks which one is better, and people who show what to do see only one.
+        return self if self.question or self.ask != "judge" else self.model_copy(update={"question": goal})
 
     def build(self, task: Task) -> WebLabeler:
-        return WebLabeler(self, task)
+        return WebLabeler(self, task, showing(self.ask, task))
 
 
 @dataclass
@@ -144,6 +155,8 @@ class WebLabeler:
 
     settings: WebSettings
     task: Task
+    shows: Showing | None = None
+    """How what people show becomes a behaviour; None where they judge."""
     console: Console = field(default_factory=Console)
     fixed: bool = False
     """No more questions will come, and all are waited for."""
@@ -157,9 +170,14 @@ class WebLabeler:
     def name(self) -> str:
         return self.settings.name
 
+    @property
+    def demonstrates(self) -> bool:
+        return self.shows is not None
+
     def open(self, store: Any, fixed: bool = False) -> list[str]:
         """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
         self.fixed = fixed
+        self._check_asked(store)
         try:
             from prefrl.page.site import Address, open_site
         except ModuleNotFoundError as error:
@@ -167,7 +185,8 @@ class WebLabeler:
         settings = self.settings
         place = Address(settings.host, settings.port, settings.allowed_hosts, settings.tls_cert, settings.tls_key)
         clips = settings.clips if named(self.task.kind).shows == "clip" else None
-        self._site = open_site(store, terms_of(settings, self.task, fixed), place, settings.name, clips)
+        terms = terms_of(settings, self.task, fixed, self.shows)
+        self._site = open_site(store, terms, place, settings.name, clips)
         try:
             late = self._draw_first(self._site)
         except BaseException:  # Ctrl-C while it waits
@@ -192,6 +211,19 @@ class WebLabeler:
         self._wait(self._site)
         while self.fixed and not self._site.say_goodbye():
             self._wait(self._site)
+
+    def _check_asked(self, store: Any) -> None:
+        """Raise `ConfigError` where the store asks what these people are not asked for."""
+        with store.log.reading() as connection:
+            sizes = records.sizes(connection)
+        wrong = [size for size in sizes if (size == 1) != self.demonstrates]
+        if wrong:
+            fits = "of one candidate" if self.demonstrates else "of two or more candidates"
+            other = "labeler.ask=judge" if self.demonstrates else "labeler.ask=action (or rewrite, for texts)"
+            raise ConfigError(
+                f"labeler.ask={self.settings.ask} asks about queries {fits}, and here are open ones of {wrong[0]}: "
+                f"set {other}"
+            )
 
     def _draw_first(self, site: Site) -> list[str]:
         """Have the clips of the first questions drawn before anybody looks; what people should know, if they are not.
@@ -238,7 +270,7 @@ class WebLabeler:
     def _file_checks(self, site: Site, store: Store[C], rng: np.random.Generator) -> None:
         """Choose check questions among the candidates of what is open, as many as will be given."""
         asked = store.counts()["asked"]
-        if not self.settings.check_share or asked == self._checked:
+        if self.demonstrates or not self.settings.check_share or asked == self._checked:
             return
         # Noted, so that a wait without new questions files no second set of checks.
         self._checked, open_ids = asked, site.open_queries()
@@ -250,10 +282,28 @@ class WebLabeler:
             cast(Any, store).ask(chosen.queries, purpose="check", expected=chosen.expected)
 
 
-def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
+def showing(ask: api.Ask, task: Task) -> Showing | None:
+    """How what people show in a task becomes a behaviour; None where they judge. Raises `ConfigError`."""
+    if ask == "action":
+        if formats()[0] == "webp":
+            raise ConfigError(f"labeler.ask=action: people go frame by frame, which takes videos: {INSTALL}")
+        found = control(task, "labeler.ask=action asks for actions in clips")
+        return ActionShowing(found.action_size, found.action_bounds)
+    if ask == "rewrite":
+        written = text(task, "labeler.ask=rewrite asks for texts")
+        tokenizer = copy.deepcopy(written.tokenizer)  # the learner pads with its own, at the same time
+
+        def encode(said: str) -> tuple[int, ...]:
+            return (*tokenizer.encode(said, add_special_tokens=False), written.ends[0])
+
+        return TextShowing(written.response_tokens, encode)
+    return None
+
+
+def terms_of(settings: WebSettings, task: Task, fixed: bool, shows: Showing | None = None) -> Terms:
     """What a project asks and how, from its settings. `fixed`: no more will be asked than the store holds."""
     kind = named(task.kind)
-    clips, question = kind.shows == "clip", settings.question or kind.question
+    clips, question = kind.shows == "clip", settings.question or question_of(settings.ask, kind)
     page = api.Page(
         title=task.name,
         question=question,
@@ -263,19 +313,34 @@ def terms_of(settings: WebSettings, task: Task, fixed: bool) -> Terms:
         minimum_watched=settings.minimum_watched if clips else 0.0,
         break_minutes=settings.break_minutes,
         ui_version=static_files.ui_version(static_files.static_files()),
+        ask=settings.ask,
+        actions=_actions(cast(ControlTask, task)) if settings.ask == "action" else None,
     )
-    lease = settings.lease_seconds or kind.lease_seconds
-    policy = Policy(settings.overlap, lease, settings.check_share, settings.repeat_share, settings.seed)
+    lease = settings.lease_seconds or (kind.lease_seconds if shows is None else SHOWING_SECONDS)
+    shares = (settings.check_share, settings.repeat_share) if shows is None else (0.0, 0.0)
+    policy = Policy(settings.overlap, lease, *shares, settings.seed)
+    shipped = default_guideline(question, kind, settings.ask)
     return Terms(
         page=page,
         policy=policy,
         strengths=dict(settings.strengths),
-        guideline=default_guideline(question, kind) if settings.guideline is None else settings.guideline,
+        guideline=shipped if settings.guideline is None else settings.guideline,
         offered=settings.guideline is None,
         consent=settings.consent,
         fps=cast(DrawnTask[Any], task).fps if clips else 0.0,
+        shows=shows,
         fixed=fixed and not settings.stay_open,
         check_warn=settings.check_warn,
         check_pause=settings.check_pause,
         rate=settings.requests_per_second,
     )
+
+
+def _actions(task: ControlTask) -> api.Actions:
+    """What people can say that the agent should do."""
+    known = list(task.action_names) if isinstance(task, NamesActions) else []
+    names = known or [""] * task.action_size
+    if task.action_bounds is None:
+        return api.Actions(discrete=True, names=names)
+    low, high = ([float(x) if math.isfinite(x) else None for x in bound] for bound in task.action_bounds)
+    return api.Actions(discrete=False, names=names, low=low, high=high)

@@ -63,7 +63,34 @@ class Timings(Body):
     """The share of each clip that was seen, slot by slot."""
 
 
-Outcome: TypeAlias = Literal["first", "second", "tie", "incomparable", "skip", "ranking"]
+Outcome: TypeAlias = Literal["first", "second", "tie", "incomparable", "skip", "ranking", "shown"]
+Ask: TypeAlias = Literal["judge", "action", "rewrite"]
+"""What people do: judge candidates, show what to do at each step of a clip, or write a response anew."""
+STEPS, DIMENSIONS = 2000, 64
+"""Of a shown behaviour at most."""
+Row: TypeAlias = Annotated[list[float], Field(min_length=1, max_length=DIMENSIONS)]
+
+
+class Shown(Body):
+    """What a person shows in the place of what the policy did: one of the two."""
+
+    actions: Annotated[list[Row | None], Field(min_length=1, max_length=STEPS)] | None = None
+    """At each step a number for each dimension, or the number of a discrete action alone; null where the policy's own
+    action is right."""
+    text: str | None = Field(None, max_length=50_000)
+
+    @model_validator(mode="after")
+    def _one(self) -> Shown:
+        if (self.actions is None) == (self.text is None):
+            raise ValueError("expected actions or a text, and not both")
+        return self
+
+
+class Draft(Body):
+    """Something that may be sent soon."""
+
+    assignment_id: Id
+    shown: Shown
 
 
 class Answer(Body):
@@ -72,11 +99,13 @@ class Answer(Body):
     submission_id: Id
     assignment_id: Id
     outcome: Outcome
-    """`first` and `second` name slots; `ranking` goes with more than two candidates."""
+    """`first` and `second` name slots; `ranking` goes with more than two candidates, `shown` with a single one."""
     strength: Literal["slight", "clear", "much"] | None = None
     """With `first` and `second` only."""
     ranking: list[Annotated[int, Field(ge=0, le=7)]] | None = Field(None, min_length=2, max_length=8)
     """A rank for each slot, 0 is best, equal ranks are ties; with `ranking` only."""
+    shown: Shown | None = None
+    """With `shown` only."""
     touched: bool = True
     """False where a ranking was sent as it was presented."""
     flags: list[Annotated[str, Field(max_length=40)]] = Field(default_factory=list, max_length=8)
@@ -91,6 +120,8 @@ class Answer(Body):
     def _consistent(self) -> Answer:
         if (self.ranking is not None) != (self.outcome == "ranking"):
             raise ValueError("ranking goes with the outcome 'ranking', and only with it")
+        if (self.shown is not None) != (self.outcome == "shown"):
+            raise ValueError("shown goes with the outcome 'shown', and only with it")
         if self.strength is not None and self.outcome not in ("first", "second"):
             raise ValueError("strength goes with the outcomes 'first' and 'second' only")
         return self
@@ -129,6 +160,17 @@ class NewGuideline(Body):
 # --- sent by the server --------------------------------------------------------------------------------------------
 
 
+class Actions(Plain):
+    """What an agent can do at a step."""
+
+    discrete: bool
+    names: list[str]
+    """Of discrete actions, or of the dimensions of others; "" for one without a name."""
+    low: list[float | None] = []
+    """The least value of each dimension, null where there is none; nothing for discrete actions."""
+    high: list[float | None] = []
+
+
 class Page(Plain):
     """How the page behaves; the same for everybody in a project."""
 
@@ -146,6 +188,9 @@ class Page(Plain):
     break_minutes: float
     """After how long at work the page suggests a break; 0 for never."""
     ui_version: str
+    ask: Ask = "judge"
+    actions: Actions | None = None
+    """For people who show actions."""
 
 
 class Progress(Plain):
@@ -193,6 +238,8 @@ class Item(Plain):
     steps: int = 0
     fps: float = 0.0
     text: str | None = None
+    actions: list[list[float]] | None = None
+    """What the policy did at each step, as in `Shown`: for people who show what it should have done."""
 
 
 class Assignment(Plain):
@@ -218,10 +265,20 @@ class Receipt(Plain):
     duplicate: bool
 
 
+class Measured(Plain):
+    """What a draft comes to."""
+
+    length: int
+    longest: int
+    """Tokens of a text, its end counted, and how many it may have; steps of a clip."""
+    fault: str
+    """Why it would be refused, one sentence; "" where it would not."""
+
+
 class Undone(Plain):
     assignment: Assignment
     answer: Json
-    """The answer that was taken back, as it was sent: outcome, strength, ranking, comment, flags."""
+    """The answer that was taken back, as it was sent: outcome, strength, ranking, shown, comment, flags."""
 
 
 class Entry(Plain):

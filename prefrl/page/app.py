@@ -172,6 +172,11 @@ def _add_work(app: FastAPI) -> None:
         """An answer. It is on disk when this returns."""
         return await served.answer(who.name, sent)
 
+    @app.post("/api/drafts", responses=errors(401, 403, 404, 409, 413, 415, 429))
+    async def drafts(sent: api.Draft, who: Someone, served: Served) -> api.Measured:
+        """What something that I may send comes to: how long it is, and whether it would be taken. Nothing is stored."""
+        return await served.measure(who.name, sent)
+
     @app.post("/api/undo", responses=errors(401, 403, 404, 409, 413, 415, 429, 503, 507))
     async def undo(sent: api.Undo, who: Someone, served: Served) -> api.Undone:
         """Take one of my last answers back."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
 from prefrl.kinds import Shown, logged
 from prefrl.page import api, records
-from prefrl.page.questions import Given
+from prefrl.page.questions import Given, Terms
+from prefrl.page.shown import Moves
 from prefrl.storage.log import EventLog
 from prefrl.types import Json
 
@@ -47,12 +48,14 @@ class ClipSource(Protocol):
 class Cards:
     """Makes the cards. May be used from any thread; it reads from the disk what it does not remember."""
 
-    def __init__(self, events: EventLog, kind: str, fps: float, lease: float, clips: ClipSource | None) -> None:
+    def __init__(
+        self, events: EventLog, terms: Terms, clips: ClipSource | None, moves: Callable[[str], Moves] | None = None
+    ) -> None:
+        """`moves` says what was done in a candidate, where people are to see it."""
         self._log = events
-        self._kind = kind
-        self._fps = fps
-        self._lease = lease
+        self._terms = terms
         self._clips = clips
+        self._moves = moves
         self._known: OrderedDict[str, list[Json]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -72,11 +75,11 @@ class Cards:
         return api.Assignment(
             assignment_id=given.id,
             query_id=given.query,
-            kind=self._kind,
+            kind=self._terms.page.kind,
             prompt=None if prompt is None else whole(prompt),
             items=[self._item(slot, candidate) for slot, candidate in enumerate(shown)],
             guideline=given.guideline,
-            lease_seconds=self._lease,
+            lease_seconds=self._terms.policy.lease_seconds,
         )
 
     def _item(self, slot: int, candidate: Json) -> api.Item:
@@ -84,7 +87,8 @@ class Cards:
         if shown.text is not None:
             return api.Item(slot=slot, text=whole(shown.text))
         media = self._clips.names(candidate["id"]) if self._clips is not None else []
-        return api.Item(slot=slot, media=media, steps=shown.steps, fps=self._fps)
+        moves = self._moves(candidate["id"]) if self._moves is not None else None
+        return api.Item(slot=slot, media=media, steps=shown.steps, fps=self._terms.fps, actions=moves)
 
     def _candidates(self, queries: Sequence[str]) -> dict[str, list[Json]]:
         with self._lock:

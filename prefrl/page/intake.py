@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 import sqlalchemy as sql
 from sqlalchemy import Connection
 
-from prefrl.judgements import Answer, Comparison, Ranking, Skip
+from prefrl.judgements import Answer, Comparison, Demonstration, Ranking, Skip
 from prefrl.page import api, records
 from prefrl.page.desk import Desk
 from prefrl.page.questions import Given, Question
 from prefrl.page.security import Refused
+from prefrl.page.shown import Showing
 from prefrl.storage.events import answer_body, answer_kind
 from prefrl.storage.log import Transaction, row
 from prefrl.storage.tables import assignment, canonical, submission
@@ -61,6 +62,8 @@ class Intake:
     desk: Desk
     strengths: dict[str, float]
     """slight, clear and much as preferences."""
+    shows: Showing | None = None
+    """How what people show becomes a behaviour; None where they judge."""
     _idle: OrderedDict[str, str] = field(default_factory=OrderedDict)
     """The newest submissions that changed nothing, of which the log says nothing, and their digests."""
 
@@ -86,16 +89,15 @@ class Intake:
         # A client that got no reply sends again: the log knows whether the first one arrived, also after a crash.
         if (seq := self._known(tx.connection, sent.submission_id, digest)) is not None:
             return Taken(seq, duplicate=True)
-        given, answered = self._own(tx.connection, name, sent.assignment_id)
+        given, answered = records.own(tx.connection, name, sent.assignment_id)
         if answered is not None and not self.desk.undone(given):
             self._note_idle(sent.submission_id, digest)
             return Taken(answered, duplicate=True)
-        answer = in_item_space(sent, given, self.strengths)
         about = self._about(sent, given, digest)
-        if given.purpose == "repeat":
-            seq = self._file_repeat(tx, given, answer, about, again=answered is not None)
+        if sent.shown is not None:
+            seq = self._file_shown(tx, given, sent.shown, about)
         else:
-            seq = self.store.put(tx, answer, about)
+            seq = self._file(tx, given, in_item_space(sent, given, self.strengths), about, again=answered is not None)
         answers = records.answers_to(tx.connection, given.query)
         return Taken(seq, False, given, answers, skipped=sent.outcome == "skip")
 
@@ -103,7 +105,7 @@ class Intake:
         """Take one of a person's last answers back. Doing it again changes nothing."""
         digest = _digest(name, sent)
         known = self._known(tx.connection, sent.submission_id, digest)
-        given, answered = self._own(tx.connection, name, sent.assignment_id)
+        given, answered = records.own(tx.connection, name, sent.assignment_id)
         answer = records.last_answer(tx.connection, given)
         if not answer:
             raise Refused(409, "this question was not answered yet: there is nothing to take back")
@@ -122,7 +124,7 @@ class Intake:
         digest = _digest(name, sent)
         if (seq := self._known(tx.connection, sent.submission_id, digest)) is not None:
             return Taken(seq, duplicate=True)
-        query = self._own(tx.connection, name, sent.assignment_id)[0].query if sent.assignment_id else ""
+        query = records.own(tx.connection, name, sent.assignment_id)[0].query if sent.assignment_id else ""
         body = {"text": sent.text, "about": {"submission": sent.submission_id, "digest": digest}}
         return Taken(tx.append(row(f"flag:{sent.submission_id}", "flag", query, name, body)), duplicate=False)
 
@@ -139,22 +141,24 @@ class Intake:
         if len(self._idle) > REMEMBERED:
             self._idle.popitem(last=False)
 
-    def _own(self, connection: Connection, name: str, id: str) -> tuple[Given, int | None]:
-        found = records.given(connection, id)
-        if found is None:
-            raise Refused(404, "there is no such assignment")
-        if found[0].annotator != name:
-            raise Refused(409, "this question was given to somebody else")
-        return found
-
     def _about(self, sent: api.Answer, given: Given, digest: str) -> Json:
         """How an answer came about, kept beside it."""
         kept = sent.model_dump(exclude={"submission_id", "assignment_id"})
         ids = {"submission": sent.submission_id, "digest": digest, "assignment": given.id}
         return kept | ids | {"guideline": sent.guideline or given.guideline}
 
-    def _file_repeat(self, tx: Transaction, given: Given, answer: Answer, about: Json, again: bool) -> int:
-        """An answer that nothing is learned from; the first one stays where it was."""
+    def _file_shown(self, tx: Transaction, given: Given, shown: api.Shown, about: Json) -> int:
+        """A demonstration, and the behaviour that it shows, in one transaction."""
+        if self.shows is None or len(given.shown) != 1:
+            raise Refused(422, "this question asks which of its candidates is better: expected a judgement of them")
+        (own,) = self.store.query(given.query).candidates
+        like = self.shows.behaviour(own, shown)
+        return self.store.show(tx, like, Demonstration(given.query, like.id, given.annotator, given.shown), about)
+
+    def _file(self, tx: Transaction, given: Given, answer: Answer, about: Json, again: bool) -> int:
+        """A judgement. Of a repeated question nothing is learned, and the first answer stays where it was."""
+        if given.purpose != "repeat":
+            return self.store.put(tx, answer, about)
         id = f"repeat:{given.id}" + (f":{about['submission']}" if again else "")
         body = {"answer": {"kind": answer_kind(answer), **answer_body(answer)}, "about": about}
         return tx.append(row(id, "repeat", given.query, given.annotator, body))
@@ -167,6 +171,8 @@ def in_item_space(sent: api.Answer, given: Given, strengths: dict[str, float]) -
     shown = given.shown
     if sent.outcome in ("skip", "incomparable"):
         return Skip(query, "skip" if sent.outcome == "skip" else "incomparable", name, shown)
+    if len(shown) < 2:
+        raise Refused(422, f"this question has one candidate: expected what to do in its place, got {sent.outcome!r}")
     if sent.outcome == "ranking" or len(shown) > 2:
         return Ranking(query, _ranks(sent, shown), name, shown)
     if sent.outcome == "tie":

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Literal, TypeAlias
 
 from prefrl.page import api
+from prefrl.page.shown import Showing
 
 Purpose: TypeAlias = Literal["label", "check", "repeat"]
 BETWEEN = "\x1f"
@@ -124,6 +125,8 @@ class Terms:
     consent: str = ""
     """What people agree to before their first question; "" for nothing."""
     fps: float = 0.0
+    shows: Showing | None = None
+    """How what people show becomes a behaviour; None where they judge."""
     fixed: bool = False
     """No more questions will come: who has answered all is done."""
     check_warn: float = 0.8

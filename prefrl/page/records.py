@@ -13,6 +13,7 @@ from sqlalchemy import Connection
 from prefrl.page.api import HISTORY
 from prefrl.page.desk import REMEMBERED
 from prefrl.page.questions import BETWEEN, Given, Past, Question
+from prefrl.page.security import Refused
 from prefrl.storage.projection import ANSWERS, JUDGEMENTS, RETRACTED, bodies
 from prefrl.storage.tables import assignment, event, query, setting, standing
 from prefrl.types import Json
@@ -79,6 +80,12 @@ def closed(connection: Connection, overlap: int) -> int:
     return _count(connection, (query.c.purpose == "label") & enough(overlap))
 
 
+def sizes(connection: Connection) -> list[int]:
+    """How many candidates the queries that nobody has answered have, each number once."""
+    waiting = sql.select(query.c.size).where(query.c.purpose == "label", done == 0)
+    return sorted(connection.scalars(waiting.distinct()))
+
+
 def judged(connection: Connection) -> tuple[int, int]:
     """How many queries were asked, and how many of them have any answer but a skip."""
     asked = query.c.purpose == "label"
@@ -113,6 +120,16 @@ def given(connection: Connection, id: str) -> tuple[Given, int | None] | None:
     return None if row is None else (_given(row), row.answered)
 
 
+def own(connection: Connection, name: str, id: str) -> tuple[Given, int | None]:
+    """The same of somebody's own assignment. Raises `Refused` where there is none, and where it is another's."""
+    found = given(connection, id)
+    if found is None:
+        raise Refused(404, "there is no such assignment")
+    if found[0].annotator != name:
+        raise Refused(409, "this question was given to somebody else")
+    return found
+
+
 def past(connection: Connection, annotator: str) -> Past:
     """What a person has done so far."""
     mine = assignment.c.annotator == annotator
@@ -144,7 +161,7 @@ def last_answer(connection: Connection, one: Given) -> Json:
 def as_sent(body: Json) -> Json:
     """An answer as the page sent it, in the order of the slots."""
     about = body.get("about") or {}
-    return {name: about.get(name) for name in ("outcome", "strength", "ranking", "comment", "flags")}
+    return {name: about.get(name) for name in ("outcome", "strength", "ranking", "shown", "comment", "flags")}
 
 
 def candidates(connection: Connection, queries: Sequence[str]) -> dict[str, list[Json]]:

@@ -22,6 +22,7 @@ from prefrl.page.desk import Desk
 from prefrl.page.intake import Intake, Reopened, Taken
 from prefrl.page.questions import Given, Terms, ignored
 from prefrl.page.security import Buckets, Refused
+from prefrl.page.shown import Moves
 from prefrl.page.texts import (
     OFFERED,
     TEXT,
@@ -65,9 +66,9 @@ class Service:
         self.access = Access()
         self.desk = Desk(self.terms.policy, self.clock)
         self.writer = Writer(self.store.log)
-        self.intake = Intake(self.store, self.desk, self.terms.strengths)
-        page, lease = self.terms.page, self.terms.policy.lease_seconds
-        self.cards = Cards(self.store.log, page.kind, self.terms.fps, lease, self.clips)
+        self.intake = Intake(self.store, self.desk, self.terms.strengths, self.terms.shows)
+        moves = self._moves if self.terms.page.ask == "action" else None
+        self.cards = Cards(self.store.log, self.terms, self.clips, moves)
         self.requests = Buckets(self.terms.rate, 3 * self.terms.rate, self.clock)
         self.logins = Buckets(1.0, 20.0, self.clock)
         self.begun = self.clock()
@@ -141,6 +142,10 @@ class Service:
         if self.terms.check_pause and taken.given is not None and taken.given.purpose == "check":
             await self._look_at_checks(name)
         return api.Receipt(seq=taken.seq, duplicate=taken.duplicate)
+
+    async def measure(self, name: str, sent: api.Draft) -> api.Measured:
+        """What a draft comes to, and whether it would be taken."""
+        return await run_in_threadpool(self._measure, name, sent)
 
     async def undo(self, name: str, sent: api.Undo) -> api.Undone:
         taken = await self.write(lambda tx: self.intake.undo(tx, name, sent), self._reopened)
@@ -244,6 +249,24 @@ class Service:
             past = records.past(connection, name)
         if not self.desk.knows(name):
             self.desk.tell(name, past)
+
+    def _moves(self, candidate: str) -> Moves:
+        assert self.terms.shows is not None
+        return self.terms.shows.moves(self.store.candidate(candidate))
+
+    def _measure(self, name: str, sent: api.Draft) -> api.Measured:
+        with self.store.log.reading() as connection:
+            given, _ = records.own(connection, name, sent.assignment_id)
+        shows = self.terms.shows
+        if shows is None:
+            raise Refused(422, "this project asks for judgements")
+        (own,) = self.store.query(given.query).candidates
+        length, longest = shows.lengths(own, sent.shown)
+        try:
+            shows.behaviour(own, sent.shown)
+        except Refused as refused:
+            return api.Measured(length=length, longest=longest, fault=refused.error)
+        return api.Measured(length=length, longest=longest, fault="")
 
     async def _look_at_checks(self, name: str) -> None:
         """Pause an annotator who surely fails too many check questions."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from prefrl.kinds import Kind
+from prefrl.page import api
 from prefrl.page.access import Event
 from prefrl.storage.log import row
 from prefrl.types import Fields
@@ -19,27 +20,57 @@ AGREED = "consent:"
 """Before the name of who has agreed, to which version."""
 
 
-ANSWERS = (
-    (
-        "One is better",
-        "choose it, and say by how much if you are asked: *slightly* for a small difference, *much* for one "
-        "that is plain at first sight.",
+ANSWERS: dict[api.Ask, tuple[tuple[str, str], ...]] = {
+    "judge": (
+        (
+            "One is better",
+            "choose it, and say by how much if you are asked: *slightly* for a small difference, *much* for one "
+            "that is plain at first sight.",
+        ),
+        ("Several at once", "put the best one first. Those that are equally good can share a place."),
+        ("Tie", "you compared them, and they are equally good or equally bad."),
+        ("Can't compare", "there is no sensible answer to the question, or no telling."),
     ),
-    ("Several at once", "put the best one first. Those that are equally good can share a place."),
-    ("Tie", "you compared them, and they are equally good or equally bad."),
-    ("Can't compare", "there is no sensible answer to the question, or no telling."),
-    ("Skip", "something is broken, or you would rather not answer. Somebody else gets the question."),
-)
+    "action": (
+        ("Set an action", "it holds from this step on, until the next step that you set."),
+        ("As the policy", "what was done is right, from this step on."),
+        ("Send", "once every step has an answer. One that you set at the first step answers them all."),
+        ("Can't tell", "there is no telling what should be done here. Nothing is learned from it."),
+    ),
+    "rewrite": (
+        ("Change the response", "as much or as little as it takes. What you send is what the model learns to write."),
+        ("Fine as it is", "there is nothing to change. Nothing is learned from it."),
+    ),
+}
+SKIP = ("Skip", "something is broken, or you would rather not answer. Somebody else gets the question.")
+HINTS: dict[api.Ask, tuple[str, ...]] = {
+    "action": (
+        "Watch the clip first: it shows what the policy did, and beside it stands what it did at each step.",
+        "Then go through it step by step. Say what you would do in the situation that you see, even where you would "
+        "not have come to it: what is shown next follows from what the policy did, not from your answer.",
+    ),
+    "rewrite": (
+        "Read the prompt, then the response to its end.",
+        "Your text answers the same prompt, and goes on right where the prompt ends. It may not be much longer than "
+        "what the model can write; the page says how much room there is.",
+    ),
+}
 ADVICE = (
     "Do not spend long on one question: your own honest impression is worth more than a guess at what "
     "others would say. Your last answers can be taken back."
 )
 
 
-def default_guideline(question: str, kind: Kind[Any]) -> str:
+def question_of(ask: api.Ask, kind: Kind[Any]) -> str:
+    """What is asked where nobody said it, in one sentence."""
+    ours = {"action": "What should be done at each step?", "rewrite": "How should this response read?"}
+    return ours.get(ask, kind.question)
+
+
+def default_guideline(question: str, kind: Kind[Any], ask: api.Ask = "judge") -> str:
     """The guideline of a project that has none of its own, as Markdown: what is asked, how to look, how to answer."""
-    look = [f"- {hint}" for hint in kind.hints]
-    answers = [f"- **{name}:** {meaning}" for name, meaning in ANSWERS]
+    look = [f"- {hint}" for hint in HINTS.get(ask, kind.hints)]
+    answers = [f"- **{name}:** {meaning}" for name, meaning in (*ANSWERS[ask], SKIP)]
     aim = [f"**{question}**", "Only this counts, whatever else may be better or worse."]
     parts = [*aim, *["## How to look", "\n".join(look)] * bool(look), "## How to answer", "\n".join(answers), ADVICE]
     return "\n\n".join(parts)

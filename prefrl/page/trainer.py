@@ -70,6 +70,8 @@ def trainer_routes() -> APIRouter:
         """Ask about texts. What was asked before is left alone."""
         if served.terms.page.kind != RESPONSES.name:
             raise Refused(409, "this project judges clips, which only its own run can ask about")
+        if served.terms.shows is not None:
+            raise Refused(409, "this project asks people to rewrite single responses, which its own run chooses")
         queries = [_query(one) for one in sent.queries]
         await served.ask(queries)
         return Filed(ids=[one.id for one in queries])

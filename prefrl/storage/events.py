@@ -153,7 +153,7 @@ _ABOUT: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("submission", "digest", "assignment"), (str,)),
     **dict.fromkeys(("guideline", "comment", "outcome", "strength"), (str, type(None))),
     **dict.fromkeys(("ranking", "flags"), (list, type(None))),
-    "timings": (dict, type(None)),
+    **dict.fromkeys(("timings", "shown"), (dict, type(None))),
 }
 """What is read of how an answer came about; whatever else stands there is kept, and read by nobody."""
 

@@ -15,7 +15,7 @@ import sqlalchemy as sql
 
 from prefrl.envs.toys import PointSettings
 from prefrl.judgements import Answer, Comparison
-from prefrl.label.web import WebLabeler, WebSettings
+from prefrl.label.web import WebLabeler, WebSettings, showing
 from prefrl.page.service import Service
 from prefrl.page.site import Site
 from prefrl.storage import tables
@@ -74,7 +74,7 @@ class House:
 
     def spoken(self, name: str = "ann") -> int:
         """How many answers of a person the log holds, whether they stand or not."""
-        kinds = ("comparison", "ranking", "choice", "rating", "skip")
+        kinds = ("comparison", "ranking", "choice", "rating", "demonstration", "skip")
         return sum(one["kind"] in kinds and one["actor"] == name for one in self.store.events())
 
     def about(self, name: str = "ann") -> list[dict[str, Any]]:
@@ -115,7 +115,8 @@ def serving(folder: Path, kind: str = "text", **settings: Any) -> Iterator[House
     chosen: dict[str, Any] = {"port": 0, "check_share": 0.0, "repeat_share": 0.0, **quiet} | settings
     task: Any = POINT.build() if kind == "control" else SimpleNamespace(kind="text", name="short stories")
     with Store[Any](folder) as store:
-        labeler = WebLabeler(WebSettings.model_validate(chosen), task)
+        asks = WebSettings.model_validate(chosen)
+        labeler = WebLabeler(asks, task, showing(asks.ask, task))
         labeler.open(store, fixed=True)
         try:
             yield House(folder, store, cast(Site, labeler._site))

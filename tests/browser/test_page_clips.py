@@ -192,5 +192,6 @@ def test_nothing_hidden_is_sent_to_the_page(clip_house: House, visit: Visit) -> 
         ann.page.reload()
     sent = answer.value.json()["assignments"][0]
     assert set(sent) == {"assignment_id", "query_id", "kind", "prompt", "items", "guideline", "lease_seconds"}
-    assert set(sent["items"][0]) == {"slot", "media", "steps", "fps", "text"}
+    assert set(sent["items"][0]) == {"slot", "media", "steps", "fps", "text", "actions"}
+    assert sent["items"][0]["actions"] is None
     assert not any(word in json.dumps(sent) for word in ("gold", "reward", "episode", "policy", "batch"))

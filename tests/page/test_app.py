@@ -47,7 +47,8 @@ def test_a_question_tells_nothing_but_what_is_judged(service: Service, ann: Test
     for one in ask_for(ann, 4):
         assert set(one) == {"assignment_id", "query_id", "kind", "prompt", "items", "guideline", "lease_seconds"}
         for item in one["items"]:
-            assert set(item) == {"slot", "media", "steps", "fps", "text"}
+            assert set(item) == {"slot", "media", "steps", "fps", "text", "actions"}
+            assert item["actions"] is None
         text = json.dumps(one)
         for word in ("gold", "reward", "episode", "batch", "purpose", "expected", "labeler", "policy"):
             assert word not in text

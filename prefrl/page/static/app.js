@@ -58,7 +58,7 @@ async function show(extra = null) {
 }
 
 function help() {
-  helpDialog(app.settings);
+  helpDialog(app.settings, session.me.page.ask);
 }
 
 /** Show the guideline; once it is closed, this version counts as read. */

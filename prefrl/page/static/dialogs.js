@@ -25,16 +25,26 @@ const GROUPS = {
     "undo",
   ],
   "help.ranking": ["up", "down", "level", "submit"],
+  "help.showing": ["stepBack", "stepOn", "more", "less", "most", "least", "own", "clear", "submit", "skip", "undo"],
+  "help.writing": ["write", "skip", "undo"],
   "help.player": ["play", "replay", "back", "forward", "slower", "faster"],
   "help.page": ["written", "comment", "guideline", "help"],
 };
 
-/** All keys, and what the answers mean. */
-export function helpDialog(settingsOpened) {
-  const groups = Object.entries(GROUPS).map(([title, actions]) =>
-    el("section", { class: "key-group" }, el("h3", { text: t(title) }), el("dl", {}, actions.map(keyRow))),
-  );
-  const meaning = ["tie", "incomparable", "skip"].map((name) =>
+/** Groups of keys that only some people need, by what these do. */
+const ONLY = { judge: ["help.answers", "help.ranking"], action: ["help.showing"], rewrite: ["help.writing"] };
+
+/** All keys of people who do this (`ask`), and what the answers mean. */
+export function helpDialog(settingsOpened, ask) {
+  const others = Object.keys(ONLY).filter((one) => one !== ask);
+  const hidden = others.flatMap((one) => ONLY[one]);
+  const groups = Object.entries(GROUPS)
+    .filter(([title]) => !hidden.includes(title))
+    .map(([title, actions]) =>
+      el("section", { class: "key-group" }, el("h3", { text: t(title) }), el("dl", {}, actions.map(keyRow))),
+    );
+  const explained = ask === "judge" ? ["tie", "incomparable", "skip"] : ["skip"];
+  const meaning = explained.map((name) =>
     el("p", {}, el("strong", { text: t(`meaning.${name}.title`) }), " ", t(`meaning.${name}`)),
   );
   const change = el("button", { type: "button", class: "secondary", text: t("help.change") });

@@ -73,8 +73,9 @@ export class History {
       el(
         "div",
         { class: "entry-main" },
-        el("span", { class: `answer-chip ${answer.outcome}`, text: inWords(answer) }),
+        el("span", { class: `answer-chip ${answer.outcome}`, text: inWords(answer, this.#app.session.me.page.ask) }),
         assignment.prompt ? el("p", { class: "entry-prompt" }, snippet(assignment.prompt, 140)) : null,
+        answer.shown?.text ? el("p", { class: "entry-shown" }, snippet(answer.shown.text, 200)) : null,
         answer.comment ? el("p", { class: "entry-comment" }, "“", el("bdi", { text: answer.comment }), "”") : null,
         details,
       ),

@@ -15,6 +15,15 @@ export const ACTIONS = {
   up: ["ArrowUp"],
   down: ["ArrowDown"],
   level: ["t"],
+  stepBack: ["ArrowLeft"],
+  stepOn: ["ArrowRight"],
+  more: ["ArrowUp"],
+  less: ["ArrowDown"],
+  most: ["Shift+ArrowUp"],
+  least: ["Shift+ArrowDown"],
+  own: ["p"],
+  clear: ["Backspace", "Delete"],
+  write: ["e"],
   submit: ["Enter"],
   incomparable: ["x"],
   skip: ["s"],
@@ -31,11 +40,28 @@ export const ACTIONS = {
   help: ["?"],
 };
 
-/** Actions that never meet one another: pairs and rankings are on different pages. */
-const RANKING = new Set(["up", "down", "level", "submit"]);
-const PAIR = new Set(["first", "second", "firstSlight", "secondSlight", "firstMuch", "secondMuch", "tie"]);
+/** Actions of one kind of question, which those of another never meet; all others are on every page. */
+const PAGES = [
+  new Set(["first", "second", "firstSlight", "secondSlight", "firstMuch", "secondMuch", "tie"]),
+  new Set(["up", "down", "level", "submit"]),
+  new Set(["stepBack", "stepOn", "more", "less", "most", "least", "own", "clear", "submit"]),
+  new Set(["write"]),
+];
 
-const SIGNS = { ArrowLeft: "←", ArrowRight: "→", ArrowUp: "↑", ArrowDown: "↓", Enter: "↵", "Shift+": "⇧" };
+function meet(one, other) {
+  const [pages, others] = [one, other].map((action) => PAGES.filter((page) => page.has(action)));
+  return !pages.length || !others.length || pages.some((page) => others.includes(page));
+}
+
+const SIGNS = {
+  ArrowLeft: "←",
+  ArrowRight: "→",
+  ArrowUp: "↑",
+  ArrowDown: "↓",
+  Enter: "↵",
+  Backspace: "⌫",
+  "Shift+": "⇧",
+};
 
 /** The keys of an action now. */
 export function bound(action) {
@@ -44,8 +70,8 @@ export function bound(action) {
 
 /** The action that already has a key and would be confused with this one, or null. */
 export function conflict(action, key) {
-  const apart = (other) => (RANKING.has(action) && PAIR.has(other)) || (PAIR.has(action) && RANKING.has(other));
-  return Object.keys(ACTIONS).find((other) => other !== action && !apart(other) && bound(other).includes(key)) ?? null;
+  const taken = (other) => other !== action && meet(action, other) && bound(other).includes(key);
+  return Object.keys(ACTIONS).find(taken) ?? null;
 }
 
 /** The name of the key of an event: letters in lower case, "Shift+" only where it does not change the sign itself. */
@@ -92,7 +118,10 @@ function taken(event) {
 
 let scopes = [];
 
-/** Make actions do something until the result is called: `{action: (event) => ...}`; later scopes come first. */
+/**
+ * Make actions do something until the result is called: `{action: (event) => ...}`; later scopes come first. One that
+ * is marked `held` goes on while its key is held down; no answer may be given so.
+ */
 export function listen(handlers, digit = null) {
   const scope = { handlers, digit };
   scopes = [scope, ...scopes];
@@ -111,11 +140,11 @@ function find(key) {
 }
 
 addEventListener("keydown", (event) => {
-  if (event.defaultPrevented || event.repeat || event.isComposing) return;
+  if (event.defaultPrevented || event.isComposing) return;
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   if (!settings.get("keys") || document.querySelector("dialog[open]") || taken(event)) return;
   const handler = find(keyName(event));
-  if (!handler) return;
+  if (!handler || (event.repeat && !handler.held)) return;
   event.preventDefault();
   handler(event);
 });

@@ -50,6 +50,7 @@ export class Labelling {
     this.#on(this.#desk, "change", () => this.#show());
     this.#on(this.#desk, "elsewhere", () => toast(t("label.elsewhere")));
     this.#on(outbox, "receipt", () => this.#received());
+    this.#on(outbox, "refused", ({ detail }) => this.#refused(detail.item));
     this.#on(outbox, "change", () => this.#desk.current || this.#show());
     this.#on(session, "state", () => this.#stateChanged());
     this.#on(document, "visibilitychange", () => document.hidden || this.#desk.refill());
@@ -105,7 +106,7 @@ export class Labelling {
   #undone(taken) {
     this.#given = this.#given.filter((one) => one.assignment.assignment_id !== taken.assignment.assignment_id);
     this.#app.pace.undone();
-    this.#say(t("undo.done", { answer: inWords(taken.answer) }), "undo");
+    this.#say(t("undo.done", { answer: inWords(taken.answer, this.#app.session.me.page.ask) }), "undo");
     this.#reopen(taken);
   }
 
@@ -173,7 +174,7 @@ export class Labelling {
     this.#earlier.delete(assignment.assignment_id);
     pace.answered();
     this.#question.confirm(given.outcome);
-    this.#say(t("label.last", { answer: inWords(body) }), "check");
+    this.#say(t("label.last", { answer: inWords(body, session.me.page.ask) }), "check");
     // Taken back while it still glows, the question stays.
     const next = () => this.#given.some((one) => one.body === body) && this.#desk.finish(assignment.assignment_id);
     setTimeout(next, calm() ? 0 : GLOW);
@@ -184,6 +185,14 @@ export class Labelling {
   #received() {
     this.#desk.refill();
     this.#paces();
+  }
+
+  /** What somebody wrote and the server did not take comes back, to be changed. */
+  #refused({ id, body }) {
+    const given = body.shown && this.#given.find((one) => one.body === body);
+    if (!given) return;
+    this.#app.outbox.dismiss(id);
+    this.#undone({ assignment: given.assignment, answer: body });
   }
 
   #stateChanged() {

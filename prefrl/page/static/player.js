@@ -47,6 +47,11 @@ export class Player extends EventTarget {
     return this.#lead?.fps ?? 30;
   }
 
+  /** The frame that is shown, from 0 on; one beyond the last at the very end. */
+  get frame() {
+    return Math.floor(this.time * this.fps + 0.01);
+  }
+
   get rate() {
     return this.#rate;
   }
@@ -90,8 +95,12 @@ export class Player extends EventTarget {
 
   /** One frame on, or back. */
   step(frames) {
-    const frame = Math.floor(this.time * this.fps + 0.01) + frames;
-    this.seek((frame + 0.25) / this.fps);
+    this.show(this.frame + frames);
+  }
+
+  /** Go to a frame, and stay there. */
+  show(frame) {
+    return this.seek((frame + 0.25) / this.fps);
   }
 
   /** Go to a time, in seconds, and stay there. */

@@ -1,9 +1,12 @@
 /** One question on the page: what is asked, the candidates, and the ways to answer. */
 
+import { Acting } from "./acting.js";
 import { calm, el, icon, iconButton } from "./dom.js";
+import { drafts } from "./drafts.js";
 import { cap, listen } from "./keys.js";
 import { Player } from "./player.js";
 import { Ranking } from "./ranking.js";
+import { Rewriting } from "./rewriting.js";
 import { Stopwatch } from "./stopwatch.js";
 import { promptView, Responses } from "./textview.js";
 import { t } from "./strings.js";
@@ -25,7 +28,8 @@ export class Question {
   #player = null;
   #prompt = null;
   #responses = null;
-  #ranking = null;
+  /** What is filled in where two buttons do not do: {element, actions, disabled}. */
+  #form = null;
   #choices = [];
   #note = el("p", { class: "gate", role: "status", testid: "gate", hidden: true });
 
@@ -45,6 +49,7 @@ export class Question {
     this.#stops.forEach((stop) => stop());
     this.#player?.close();
     this.#responses?.close();
+    this.#form?.close?.();
     this.#watch.stop();
   }
 
@@ -73,12 +78,14 @@ export class Question {
     const bar = this.#bar(tools);
     this.#choices = bar.buttons;
     const controls = this.#player && transport(this.#player);
-    const ranking = this.#pair ? null : this.#rank(items);
+    const form = this.#fill(items);
     this.#listen(bar.actions, controls?.actions, this.#responses?.actions);
+    const beside = form instanceof Rewriting;
+    const sort = form instanceof Ranking ? "many" : form ? "showing" : "pair";
     const element = el(
       "article",
       {
-        class: `question ${film ? "film" : "text"} ${ranking ? "many" : "pair"}`,
+        class: `question ${film ? "film" : "text"} ${sort}`,
         testid: "question",
         data: { id: this.#assignment.assignment_id, kind, count: String(items.length), ready: "false" },
       },
@@ -97,10 +104,11 @@ export class Question {
           "div",
           { class: "slots" },
           items.map((item, at) => this.#slot(item, at)),
+          beside && form.element,
         ),
       ),
       controls?.element,
-      ranking?.element,
+      beside ? null : form?.element,
       bar.element,
     );
     cap(element);
@@ -120,22 +128,46 @@ export class Question {
       el(
         "header",
         { class: "slot-head" },
-        el("span", { class: "badge", data: { slot: String(at) }, text: String(at + 1) }),
+        el("span", { class: "badge", data: { slot: String(at) }, text: this.#name(at) }),
         el("span", { class: "chosen-mark", "aria-hidden": "true" }, icon("check")),
       ),
       body,
     );
   }
 
+  /** Candidates have numbers; a single one is what the policy did. */
+  #name(at) {
+    return this.#assignment.items.length > 1 ? String(at + 1) : t("slot.own");
+  }
+
   #bar(tools) {
     return verdict({
       pair: this.#pair,
+      ask: this.#page.ask,
       strength: this.#page.strength,
       earlier: this.#earlier,
       note: this.#note,
       tools,
       answer: (chosen, event) => this.#give(chosen, event),
     });
+  }
+
+  #fill(items) {
+    if (this.#page.ask !== "judge") this.#form = this.#show(items[0]);
+    else if (!this.#pair) this.#form = this.#rank(items);
+    return this.#form;
+  }
+
+  /** People show one thing at a time: actions in a clip, or a text. What they have begun outlives a reload. */
+  #show(item) {
+    const id = this.#assignment.assignment_id;
+    const common = {
+      earlier: this.#earlier?.shown ?? drafts.get(id),
+      keep: (shown) => drafts.set(id, shown),
+      submit: (shown, event) => this.#give({ outcome: "shown", shown }, event),
+    };
+    if (this.#player) return new Acting(item, { ...common, player: this.#player, choices: this.#page.actions });
+    return new Rewriting(item, { ...common, id, mark: (runs) => this.#responses.mark(runs, this.#page) });
   }
 
   #rank(items) {
@@ -145,14 +177,12 @@ export class Question {
       const found = this.element.querySelector(`.slot[data-slot="${slot}"]`);
       found.scrollIntoView({ block: "nearest", behavior: calm() ? "auto" : "smooth" });
     };
-    const lent = { clips: this.#player?.clips, look };
-    this.#ranking = new Ranking(items, submit, this.#earlier?.ranking, lent);
-    return this.#ranking;
+    return new Ranking(items, submit, this.#earlier?.ranking, { clips: this.#player?.clips, look });
   }
 
   #listen(...groups) {
-    const ranking = this.#ranking;
-    this.#stops.push(listen(Object.assign({}, ...groups, ranking?.actions), ranking?.digit));
+    const form = this.#form;
+    this.#stops.push(listen(Object.assign({}, ...groups, form?.actions), form?.digit));
   }
 
   /** Answers are taken when all is there to be seen, and a moment has passed. */
@@ -174,6 +204,7 @@ export class Question {
   /** Begin to play, once the question is on the page. */
   begin() {
     this.#prompt?.begin();
+    this.#form?.begin?.();
     this.#player?.begin();
     this.#player?.ready.then(() => this.#gate());
   }
@@ -197,7 +228,7 @@ export class Question {
     if (gate.textContent !== words) gate.textContent = words;
     gate.hidden = !words;
     this.element.dataset.gate = this.#player?.failed ? "broken" : reason ? "watch" : "";
-    if (this.#ranking) this.#ranking.disabled = Boolean(reason);
+    if (this.#form) this.#form.disabled = Boolean(reason);
     for (const node of this.#choices) node.disabled = Boolean(reason) && node.dataset.action !== "skip";
     const verdictBar = this.element.querySelector(".verdict");
     verdictBar.setAttribute("aria-disabled", String(this.element.dataset.ready !== "true"));
@@ -208,6 +239,7 @@ export class Question {
     const skip = chosen.outcome === "skip";
     if (this.#given || (this.#locked && !(skip && this.#waited)) || (this.#closed && !skip)) return;
     this.#given = true;
+    drafts.set(this.#assignment.assignment_id, null);
     const body = { ...chosen, timings: this.#timings(), input: means(event) };
     if (this.#page.strength === false || !["first", "second"].includes(chosen.outcome)) body.strength = null;
     this.#answer(body, event);

@@ -39,6 +39,7 @@ export class Responses {
   #note = el("span", { class: "diff-note", role: "status" });
   #stop;
   #compared = null;
+  #marks = null;
   #shown = [];
 
   /** `prompt` is what they answer. */
@@ -54,6 +55,12 @@ export class Responses {
 
   close() {
     this.#stop();
+  }
+
+  /** Show from now on which parts of the first response are gone in another text. */
+  mark(runs, page) {
+    this.#marks = runs.some((run) => run.alone) ? [runs] : null;
+    this.#show(page);
   }
 
   /** What keys do here. */
@@ -84,7 +91,7 @@ export class Responses {
         drawn: drawn(page),
         invisible: settings.get("invisible"),
         length: settings.get("length"),
-        runs: diff && [diff.first, diff.second][at],
+        runs: diff ? [diff.first, diff.second][at] : this.#marks?.[at],
       }),
     );
     this.#shown.forEach((show) => show());
@@ -128,8 +135,8 @@ export class Responses {
     return el(
       "div",
       { class: "text-tools", role: "toolbar", "aria-label": t("text.tools") },
-      item("stacked", "text.stacked", "toggle-stacked"),
-      item("linked", "text.linked", "toggle-linked"),
+      count > 1 ? item("stacked", "text.stacked", "toggle-stacked") : null,
+      count > 1 ? item("linked", "text.linked", "toggle-linked") : null,
       page.markdown ? item("written", "text.written", "toggle-written", "written") : null,
       count === 2 ? item("diff", "text.diff", "toggle-diff") : null,
       item("invisible", "text.invisible", "toggle-invisible"),

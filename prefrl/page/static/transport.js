@@ -35,7 +35,7 @@ export function transport(player) {
     scrub.max = String(player.duration || 1);
     scrub.value = String(player.time);
     const last = Math.max(0, Math.round(player.duration * player.fps) - 1);
-    const frame = Math.min(last, Math.floor(player.time * player.fps + 0.01));
+    const frame = Math.min(last, player.frame);
     clock.textContent = t("player.clock", {
       time: player.time.toFixed(1),
       duration: player.duration.toFixed(1),

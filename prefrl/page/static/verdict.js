@@ -26,9 +26,9 @@ function choice({ action, testid, label, short, spoken, kind, slot, sign, run })
 
 /**
  * The bar for an assignment: {element, actions}. `answer({outcome, strength}, event)` is called with what was chosen,
- * `earlier` is an answer that was taken back, and `note` says why there cannot be one yet.
+ * `earlier` is an answer that was taken back, `note` says why there cannot be one yet, and `ask` what people do here.
  */
-export function verdict({ pair, strength, answer, earlier, note, tools }) {
+export function verdict({ pair, ask, strength, answer, earlier, note, tools }) {
   const buttons = [];
   const actions = {};
   const add = (outcome, step, look) => {
@@ -49,7 +49,7 @@ export function verdict({ pair, strength, answer, earlier, note, tools }) {
       add("incomparable", null, {
         action: "incomparable",
         testid: "incomparable",
-        label: t("answer.incomparable"),
+        label: nothing(ask),
         kind: "quiet",
       }),
       add("skip", null, { action: "skip", testid: "skip", label: t("answer.skip"), kind: "quiet" }),
@@ -126,15 +126,22 @@ function graded(add, outcome, slot, step) {
   });
 }
 
-/** An answer in words. */
-export function inWords({ outcome, strength, ranking }) {
+/** What is said where there is nothing to answer. */
+function nothing(ask) {
+  if (ask === "action") return t("answer.untold");
+  return ask === "rewrite" ? t("answer.fine") : t("answer.incomparable");
+}
+
+/** An answer in words; `ask` is what people do here. */
+export function inWords({ outcome, strength, ranking, shown }, ask) {
+  if (outcome === "shown") return shown?.text === undefined ? t("answer.shown") : t("answer.written");
   if (outcome === "first" || outcome === "second") {
     const slot = outcome === "first" ? 1 : 2;
     return strength ? SPOKEN(slot)[strength] : t("answer.better", { slot });
   }
   if (outcome === "ranking") return order(ranking ?? []);
   if (outcome === "tie") return t("answer.tie");
-  return outcome === "skip" ? t("answer.skipped") : t("answer.incomparable");
+  return outcome === "skip" ? t("answer.skipped") : nothing(ask);
 }
 
 /** Ranks by slot as "2 > 1 = 3". */
