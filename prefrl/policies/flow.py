@@ -290,12 +290,12 @@ def _pairs(p: torch.nn.ParameterDict, net: str) -> list[tuple[Tensor, Tensor]]:
 def _executed(left: Floats, execute: int, chunk: int) -> Bools:
     """(n, T) how many actions were left -> (n, T, C): which of a plan that began there were executed in these T steps.
 
-    A plan ends where its episode does: then another one begins, and counts from its own start.
+    A plan ends where its episode does: then another one begins, and counts from its own start. Beyond the last step
+    stands that step again, of which as many are left as of it, and not fewer.
     """
     steps = left.shape[1]
     ahead = np.arange(steps)[:, None] + np.arange(chunk)  # (T, C)
-    within = left[:, ahead.clip(max=steps - 1)] == execute - np.arange(chunk)
-    found: Bools = within & (ahead < steps)
+    found: Bools = left[:, ahead.clip(max=steps - 1)] == execute - np.arange(chunk)
     return found
 
 

@@ -80,13 +80,12 @@ def _flow(folder: Path, task: ControlTask, settings: FlowPolicySettings) -> Stat
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
     there, wanted = said["learner"].get("policy") or {}, settings.model_dump(mode="json")
     # How a plan is made and measured is no part of the network.
-    other = {
-        name: there.get(name) for name, value in wanted.items() if name in OF_NETWORKS and there.get(name) != value
-    }
+    other = [name for name in sorted(OF_NETWORKS) if there.get(name) != wanted[name]]
     if other:
+        theirs, here = ({name: said.get(name) for name in other} for said in (there, wanted))
         raise ConfigError(
-            f"learner.start: the policy of {folder} has learner.policy {other}, and here they are "
-            f"{ ({name: wanted[name] for name in other}) }: set them alike"
+            f"learner.start: the policy of {folder} has learner.policy {theirs}, and here they are {here}: "
+            "set them alike"
         )
     if (found := task_of(said)).name != task.name:
         raise ConfigError(f"learner.start: expected a policy for {task.name}, and {folder} is a run of {found.name}")
