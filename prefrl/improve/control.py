@@ -206,13 +206,16 @@ class ControlLearnerSettings(Settings):
 
     def formula(self) -> str:
         """The objective, as text."""
+        flows = isinstance(self.policy, FlowPolicySettings)
+        ratio = "exp(L_old(a|s) - L(a|s)) of flow-matching losses" if flows else "pi(a|s) / pi_old(a|s)"
         surrogate = (
-            "log pi(a|s) A"
+            ("-L(a|s) A of the flow-matching loss" if flows else "log pi(a|s) A")
             if self.clip is None
-            else f"min(r A, clip(r, {1 - self.clip:g}, {1 + self.clip:g}) A),  r = pi(a|s) / pi_old(a|s)"
+            else f"min(r A, clip(r, {1 - self.clip:g}, {1 + self.clip:g}) A),  r = {ratio}"
         )
+        bonus = "" if flows else f" + {self.entropy:g} H[pi]"
         lines = [
-            f"maximise  mean[ {surrogate} ] + {self.entropy:g} H[pi] - {self.value_weight:g} mean[ (V(s) - R)^2 / 2 ]",
+            f"maximise  mean[ {surrogate} ]{bonus} - {self.value_weight:g} mean[ (V(s) - R)^2 / 2 ]",
             f"A = GAE(discount {self.discount:g}, lambda {self.trace:g}) of the learned reward, whitened per rollout",
             "R = A + V before whitening; a time limit bootstraps from V(final observation), a termination does not",
             f"{self.epochs} epochs over each rollout; {self.critic_epochs} more for V alone after each reward fit",

@@ -145,6 +145,8 @@ def test_what_it_cannot_be_is_said() -> None:
     flow = {"policy": {"kind": "flow"}}
     settings = ControlLearnerSettings.model_validate(flow)
     assert (settings.entropy, settings.target_kl) == (0.0, None)
+    assert "r = exp(L_old(a|s) - L(a|s))" in settings.formula()
+    assert "H[pi]" not in settings.formula()
     for name, value in (("entropy", 0.1), ("target_kl", 0.01)):
         with pytest.raises(ValueError, match=rf"\.{name}: expected .* with policy.kind=flow, got {value}"):
             ControlLearnerSettings.model_validate(flow | {name: value})
