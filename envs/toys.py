@@ -16,6 +16,8 @@ from prefrl.types import Bools, Floats, Segment
 REACH = 1.5
 """How far from the middle the picture shows."""
 TURNS = ("on", "left", "right")
+DISC, GOAL, GOAL_SIZE = 0.6, np.array([0.0, 1.0]), 0.15
+"""Of the fork: the radius of what stands in the middle, and where to go."""
 INK, MARK = (34, 87, 150), (214, 116, 30)
 
 
@@ -101,6 +103,70 @@ class TMaze:
             top = middle + int(row) * cell
             picture[top : top + cell, column : column + cell] = ink
         return picture
+
+
+@dataclass(frozen=True)
+class Fork:
+    """A point that has to pass a disc in the middle, on its left or on its right, to a goal beyond it.
+
+    It moves by up to 0.1 along each axis, and stays where it hits the disc or reaches the goal. The gold is 1 in the
+    step that reaches the goal, by the `side` that is wanted, and 0 else: that of an episode says whether it got there.
+    It starts so near the disc that who cannot tell the side at once, as the mean of both ways cannot, often hits it.
+
+    A state is (x, y, 1 where it got there or -1 where it hit, side on which it was abreast of the disc).
+    """
+
+    side: Literal["either", "left", "right"] = "either"
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        states = np.zeros((count, 4))
+        states[:, 0], states[:, 1] = rng.uniform(-0.05, 0.05, count), -0.8
+        return states
+
+    def advance(self, states: Floats, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Bools]:
+        moves = (states[:, 2] == 0)[:, None]
+        at = np.where(moves, np.clip(states[:, :2] + 0.1 * np.clip(actions, -1.0, 1.0), -REACH, REACH), states[:, :2])
+        passed = np.where((states[:, 1] < 0) & (at[:, 1] >= 0), np.sign(at[:, 0]), states[:, 3])
+        hit, there = np.linalg.norm(at, axis=1) < DISC, np.linalg.norm(at - GOAL, axis=1) < GOAL_SIZE
+        ended = np.where(moves[:, 0], 1.0 * there - hit, states[:, 2])
+        wanted = {"either": True, "left": passed < 0, "right": passed > 0}[self.side]
+        gold = 1.0 * (moves[:, 0] & there & wanted)
+        return np.column_stack([at, ended, passed]), gold, np.zeros(len(states), bool)
+
+    def observe(self, states: Floats) -> Floats:
+        """(n, 2): where it is."""
+        return states[:, :2].astype(np.float32)
+
+    def legal(self, states: Floats) -> Bools | None:
+        return None
+
+    def picture(self, state: Floats, size: int) -> np.ndarray:
+        """The disc in grey, the goal in orange, the point in blue."""
+        axis = np.linspace(-REACH, REACH, size)
+        grid = np.stack(np.meshgrid(axis, -axis), -1)
+        picture = np.full((size, size, 3), 246, np.uint8)
+        for middle, radius, ink in ((np.zeros(2), DISC, 150), (GOAL, GOAL_SIZE, MARK), (state[:2], 0.08, INK)):
+            picture[np.linalg.norm(grid - middle, axis=-1) < radius] = ink
+        return picture
+
+
+class ForkSettings(Settings):
+    """A point that has to pass a disc on either side to a goal: whoever averages both ways runs into the disc."""
+
+    kind: Literal["fork"] = "fork"
+    side: Literal["either", "left", "right"] = "either"
+    """On which side it has to pass for the gold; on either by default."""
+    horizon: int = Field(40, ge=2)
+    """Steps of an episode; about 25 lead to the goal."""
+    segment_steps: int | None = Field(None, ge=1)
+    """Steps of a judged segment; whole episodes when left out, since only they show whether it got there."""
+    frame_size: int = Field(120, ge=16, le=2048)
+    """Height and width of drawn frames, in pixels."""
+
+    def build(self) -> ToyTask:
+        bounds = -np.ones(2, np.float32), np.ones(2, np.float32)
+        parts = "fork", Fork(self.side), self.horizon, self.segment_steps or self.horizon, self.frame_size
+        return ToyTask(*parts, action_size=2, fps=10.0, action_bounds=bounds)
 
 
 class TMazeSettings(Settings):

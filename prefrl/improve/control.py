@@ -25,10 +25,11 @@ from prefrl.components import ConfigError, Settings, filled_in
 from prefrl.distributed import each_tensor, world
 from prefrl.improve.gradient import Batch, adam, steer, update
 from prefrl.improve.objectives import Objective, gae, masked_whiten
-from prefrl.improve.player import Player
+from prefrl.improve.player import NO_ZIP, Player
 from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
 from prefrl.policies.cnn import CNNPolicySettings
 from prefrl.policies.divided import environments, of_all
+from prefrl.policies.flow import FlowPolicy, FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
@@ -46,6 +47,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 """Where their defaults are others than those of the fields below."""
 ITS_OWN = {"hidden", "initial_std", "squash", "sde", "sde_steps"}
 """Settings of a policy that starts from another one, and that may be the other's."""
+OF_FLOWS: dict[str, Any] = {"entropy": 0.0, "target_kl": None}
+"""What a flow gives neither: settings that may not be others there, and need not be named."""
 MOVED = ("hidden", "initial_std")
 """Settings that were the learner's own once, and are its policy's."""
 SLOWER = 0.3
@@ -61,7 +64,7 @@ def _of_some_kind(given: Any) -> Any:
 
 
 PolicySettings: TypeAlias = Annotated[
-    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings | TransformerPolicySettings,
+    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings | TransformerPolicySettings | FlowPolicySettings,
     Field(discriminator="kind"),
     BeforeValidator(_of_some_kind),
 ]
@@ -129,7 +132,8 @@ class ControlLearnerSettings(Settings):
         moved = [name for name in MOVED if isinstance(given, dict) and name in given]
         if moved:
             raise ValueError("\n".join(f".{name}: this is now learner.policy.{name}; write it there" for name in moved))
-        return filled_in(given, ALGORITHMS)
+        found = filled_in(given, ALGORITHMS)
+        return OF_FLOWS | found if isinstance(found, dict) and _flows(found.get("policy")) else found
 
     @classmethod
     def renamed(cls, saved: dict[str, Any]) -> dict[str, Any]:
@@ -149,12 +153,37 @@ class ControlLearnerSettings(Settings):
     @model_validator(mode="after")
     def _plain_start(self) -> ControlLearnerSettings:
         plain = MLPPolicySettings().model_dump(exclude=ITS_OWN).items()
-        if self.start is not None and not plain <= self.policy.model_dump().items():
+        flows = isinstance(self.policy, FlowPolicySettings)
+        if self.start is not None and not flows and not plain <= self.policy.model_dump().items():
             raise ValueError(
-                "start takes over a policy of kind mlp with tanh and one width for actor and critic: leave "
+                "start takes over a flow, or a policy of kind mlp with tanh and one width for actor and critic: leave "
                 f"learner.policy as it is, but for {', '.join(sorted(ITS_OWN))}"
             )
         return self
+
+    @model_validator(mode="after")
+    def _of_flows(self) -> ControlLearnerSettings:
+        if not isinstance(self.policy, FlowPolicySettings):
+            return self
+        for name, value in OF_FLOWS.items():
+            if (came := getattr(self, name)) != value:
+                raise ValueError(
+                    f".{name}: expected {'null' if value is None else value} with policy.kind=flow, got {came}: a flow "
+                    "gives no log-probability, and so neither an entropy nor a KL; leave it out"
+                )
+        if min(self.rollout_lengths()) < self.policy.execute:
+            raise ValueError(
+                f".rollout_steps: a rollout has {min(self.rollout_lengths())} steps, and a plan of "
+                f"{self.policy.execute} does not end in it: raise it, or steps_per_round"
+            )
+        return self
+
+    def rollout_lengths(self) -> list[int]:
+        """Steps in each environment of a round's rollouts."""
+        each = self.steps_per_round // self.environments
+        # Equal parts: a short last rollout would whiten its advantages over a handful of steps.
+        parts = max(1, round(each / self.rollout_steps))
+        return [len(part) for part in np.array_split(np.arange(each), parts)]
 
     def shrunk(self) -> ControlLearnerSettings:
         steps = min(self.steps_per_round, self.environments * self.rollout_steps)
@@ -177,13 +206,16 @@ class ControlLearnerSettings(Settings):
 
     def formula(self) -> str:
         """The objective, as text."""
+        flows = isinstance(self.policy, FlowPolicySettings)
+        ratio = "exp(L_old(a|s) - L(a|s)) of flow-matching losses" if flows else "pi(a|s) / pi_old(a|s)"
         surrogate = (
-            "log pi(a|s) A"
+            ("-L(a|s) A of the flow-matching loss" if flows else "log pi(a|s) A")
             if self.clip is None
-            else f"min(r A, clip(r, {1 - self.clip:g}, {1 + self.clip:g}) A),  r = pi(a|s) / pi_old(a|s)"
+            else f"min(r A, clip(r, {1 - self.clip:g}, {1 + self.clip:g}) A),  r = {ratio}"
         )
+        bonus = "" if flows else f" + {self.entropy:g} H[pi]"
         lines = [
-            f"maximise  mean[ {surrogate} ] + {self.entropy:g} H[pi] - {self.value_weight:g} mean[ (V(s) - R)^2 / 2 ]",
+            f"maximise  mean[ {surrogate} ]{bonus} - {self.value_weight:g} mean[ (V(s) - R)^2 / 2 ]",
             f"A = GAE(discount {self.discount:g}, lambda {self.trace:g}) of the learned reward, whitened per rollout",
             "R = A + V before whitening; a time limit bootstraps from V(final observation), a termination does not",
             f"{self.epochs} epochs over each rollout; {self.critic_epochs} more for V alone after each reward fit",
@@ -227,7 +259,7 @@ class ControlLearner:
         scorer, count = step_rewards(reward), self._settings.environments
         envs, rollouts, metrics = environments(self._task, count), [], []
         observations, memory, begins = envs.reset(rng), None, None
-        lengths = self._rollout_lengths()
+        lengths = self._settings.rollout_lengths()
         for number, steps in enumerate(lengths):
             if number and self._settings.fresh_starts:
                 observations, memory, begins = envs.reset(rng), None, None
@@ -286,10 +318,7 @@ class ControlLearner:
         """As a zip of stable-baselines3's PPO, which acts as this policy does. Raises ConfigError for kinds of policies
         that it has not."""
         if not isinstance(self.policy, MLPPolicy):
-            raise ConfigError(
-                "a zip of stable-baselines3's PPO can only hold a policy of kind mlp, and this one is of kind "
-                f"{self._settings.policy.kind}: act with it through prefrl.load_policy"
-            )
+            raise ConfigError(NO_ZIP.format(self._settings.policy.kind))
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
         self._begin()
@@ -337,18 +366,12 @@ class ControlLearner:
     def _begin(self) -> None:
         """Take over the policy that this one starts from, once."""
         if self._start is not None:
-            assert isinstance(self._settings.policy, MLPPolicySettings)
-            assert isinstance(self.policy, MLPPolicy)
+            assert isinstance(self._settings.policy, MLPPolicySettings | FlowPolicySettings)
+            assert isinstance(self.policy, MLPPolicy | FlowPolicy)
             self.policy.load(starting_state(self._start, self._task, self._settings.policy))
             # Few demonstrations show a part of the world: what lies elsewhere would change every scale at once.
             self.policy.freeze()
             self._start = None
-
-    def _rollout_lengths(self) -> list[int]:
-        each = self._settings.steps_per_round // self._settings.environments
-        # Equal parts: a short last rollout would whiten its advantages over a handful of steps.
-        parts = max(1, round(each / self._settings.rollout_steps))
-        return [len(part) for part in np.array_split(np.arange(each), parts)]
 
     def _left(self, done: float) -> float:
         """What is left of the learning rate when that share of the round is done."""
@@ -385,6 +408,8 @@ class ControlLearner:
             steer(self._optimizer, kl / left**2, settings.target_kl, settings.learning_rate)
         means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
         # The first step's, where nothing has changed yet: anything but rounding is a bug.
+        if not self.policy.exact:
+            del means["kl_old"]  # of ratios that are no probabilities' it would be none
         means["learning_rate"] = left * self._optimizer.param_groups[0]["lr"]
         return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
 
@@ -406,8 +431,11 @@ class ControlLearner:
         following = self._next_values(rollout, values, reading.final, unseen)
         ends = self._tensor(rollout.ends)
         scaled = self._tensor(rewards).float() * _scale(settings.discount)
-        advantages = gae(scaled, values, following, ends, settings.discount, settings.trace)
+        advantages = gae(scaled, values, following, ends, settings.discount, self._trace(reading.decides))
         returns = advantages + values
+        if reading.decides is not None:  # (n, T) -> (B, 1): each decision is a sequence of its own
+            at = self._tensor(reading.decides)
+            advantages, returns = advantages[at][:, None], returns[at][:, None]
         # The clamp: returns that do not vary leave nothing to explain.
         explained = 1.0 - float(advantages.var() / returns.var().clamp(min=1e-12))
         # Whitened only now: the critic's targets above are in the units of the reward.
@@ -415,6 +443,17 @@ class ControlLearner:
         # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
         logp, _ = policy.log_prob(reading.inputs)
         return Batch(reading.inputs, logp, in_chunks(white, policy.chunk), in_chunks(returns, policy.chunk)), explained
+
+    def _trace(self, decides: Bools | None) -> float | Tensor:
+        """GAE's lambda, (n, T) where some steps only carry out what was decided before.
+
+        Into such steps it is 1, and what they are worth cancels: between two decisions only rewards are summed.
+        """
+        trace = self._settings.trace
+        if decides is None:
+            return trace
+        following = np.concatenate([decides[:, 1:], decides[:, :1]], 1)  # a row's last step leads out of it
+        return self._tensor(np.where(following, trace, 1.0).astype(np.float32))
 
     def _next_values(self, rollout: Rollout, values: Tensor, final: Tensor, unseen: Bools) -> Tensor:
         """(n, T): the value of what each step led to; `final` (k,) are those that were `unseen` (n, T)."""
@@ -443,6 +482,11 @@ class ControlLearner:
     def _tensor(self, array: np.ndarray) -> Tensor:
         """An array on the policy's device."""
         return torch.from_numpy(array).to(self.policy.device)
+
+
+def _flows(policy: Any) -> bool:
+    """Whether that much of the settings of a policy says that it is a flow."""
+    return policy.get("kind") == "flow" if isinstance(policy, dict) else isinstance(policy, FlowPolicySettings)
 
 
 def _scale(discount: float) -> float:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from prefrl.fit.pairs import Batch
 from prefrl.improve.objectives import cpl_loss
-from prefrl.improve.offline import Material, Offline, OfflineSettings, Recordings, minibatches
+from prefrl.improve.offline import Material, Offline, OfflineSettings, Recordings, gaussian, minibatches
 from prefrl.improve.pairs import means, measured, some
 from prefrl.protocols import RewardModel, Task, control
 from prefrl.types import Integers, Metrics, Segment
@@ -47,7 +47,7 @@ class CPLSettings(OfflineSettings):
 
     def build(self, task: Task, rng: np.random.Generator) -> Offline:
         found = control(task, f"learner kind {self.kind!r} learns from segments of control")
-        return Offline(self, found, partial(improve, self), rng, self.discount, self.alpha)
+        return Offline(self, found, partial(improve, self), gaussian(self, found, rng), self.discount, self.alpha)
 
     def formula(self) -> str:
         later = "" if self.discount == 1 else f"{self.discount:g}^t "

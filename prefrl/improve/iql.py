@@ -23,7 +23,7 @@ from torch import Tensor
 
 from prefrl.improve.gradient import adam, descend
 from prefrl.improve.objectives import expectile_loss
-from prefrl.improve.offline import Material, Offline, OfflineSettings, Recordings
+from prefrl.improve.offline import Material, Offline, OfflineSettings, Recordings, gaussian
 from prefrl.improve.pairs import means
 from prefrl.policies.perceptron import perceptrons
 from prefrl.policies.rollout import step_rewards
@@ -65,7 +65,7 @@ class IQLSettings(OfflineSettings):
 
     def build(self, task: Task, rng: np.random.Generator) -> Offline:
         found = control(task, f"learner kind {self.kind!r} learns from segments of control")
-        return Offline(self, found, partial(improve, self), rng, self.discount)
+        return Offline(self, found, partial(improve, self), gaussian(self, found, rng), self.discount)
 
     def formula(self) -> str:
         return (

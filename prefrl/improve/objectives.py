@@ -91,11 +91,14 @@ def step_rewards(scores: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tenso
     return rewards.scatter_add(1, last[:, None], (scores * mask.any(1))[:, None].to(rewards.dtype))
 
 
-def gae(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, discount: float, trace: float) -> Tensor:
+def gae(
+    rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, discount: float, trace: float | Tensor
+) -> Tensor:
     """(B, L) generalised advantages (Schulman et al. 2016, equation 16).
 
     `next_values` is the value of what each step led to: 0 after a termination, the value of the final observation
-    after a truncation. `ends` is 1 where an episode stops, for either reason. Padding must be 0 in every argument.
+    after a truncation. `ends` is 1 where an episode stops, for either reason. `trace` may differ from step to step,
+    (B, L): it is that of what the step leads to. Padding must be 0 in every argument.
     """
     delta = rewards + discount * next_values - values
     # Any end cuts the trace: what comes after a time limit is another episode, though its value still bootstraps.

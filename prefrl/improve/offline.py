@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeAlias, cast
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
+from typing_extensions import TypeVar
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
 from prefrl.exchange.recordings import recording
 from prefrl.fit.pairs import Batch, batch
 from prefrl.fit.split import split
@@ -25,15 +26,15 @@ from prefrl.improve import gradient
 from prefrl.improve.gradient import adam, descend_by_logp, update
 from prefrl.improve.objectives import Objective
 from prefrl.improve.pairs import measured, shuffled
-from prefrl.improve.player import Player
+from prefrl.improve.player import NO_ZIP, Player
 from prefrl.kinds import kind_of
-from prefrl.policies.acting import Actor, Decisions
+from prefrl.policies.acting import Acting, Actor, Clonable, Decisions, Memory
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask, Recorded, RewardModel, Store
 from prefrl.sample.segments import piece
 from prefrl.seeding import Device, device_of
-from prefrl.types import Evaluation, Integers, Metrics, Segment, State, Steps
+from prefrl.types import Evaluation, Floats, Integers, Metrics, Segment, State, Steps
 
 ROUNDING = 1e-4
 """By how much an action may lie outside of its bounds: files hold them in few digits."""
@@ -91,11 +92,8 @@ class Recordings:
 
     @classmethod
     def of(cls, segments: Sequence[Segment], policy: MLPPolicy) -> Recordings:
-        observations = policy.normalise(np.concatenate([one.observations for one in segments]))
-        choices = policy.space.choices(np.concatenate([one.actions for one in segments]))
         lengths = np.array([len(one) for one in segments])
-        arrays = (torch.from_numpy(x).to(policy.device) for x in (observations, choices))
-        return cls(Decisions(*arrays), np.cumsum(lengths) - lengths, lengths)
+        return cls(policy.examples(segments), np.cumsum(lengths) - lengths, lengths)
 
     def steps(self, at: Integers) -> tuple[Integers, Integers, Integers]:
         """Of some segments: the rows of their steps, whose each is among those, and how many came before it."""
@@ -113,11 +111,12 @@ class Material(NamedTuple):
     """Judged ones and those of the file."""
 
 
-Improve: TypeAlias = Callable[["Offline", Material, RewardModel[Segment], np.random.Generator], Metrics]
+P = TypeVar("P", bound=Clonable[Any], default=MLPPolicy)
+Improve: TypeAlias = Callable[["Offline[Any]", Material, RewardModel[Segment], np.random.Generator], Metrics]
 """One round's worth of learning, after cloning."""
 
 
-class Offline:
+class Offline(Generic[P]):
     """A `prefrl.protocols.Learner` of segments that takes no step to learn; methods differ in how they improve alone.
 
     `discount` and `alpha` make a score of a segment's log-probabilities, which held-out judgements are compared with;
@@ -129,15 +128,13 @@ class Offline:
         settings: OfflineSettings,
         task: ControlTask,
         improve: Improve,
-        rng: np.random.Generator,
+        policy: P,
         discount: float = 1.0,
         alpha: float | None = None,
-        learns_std: bool = False,
     ) -> None:
         self._settings, self._task, self._improve = settings, task, improve
-        self._discount, self._alpha = discount, alpha
-        network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
-        self.policy, self._learns_std = MLPPolicy(network, task, rng, learns_std), learns_std
+        self._discount, self.alpha = discount, alpha
+        self.policy = policy
         self.policy.to(device_of(settings.device))
         self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._player, self._measured = Player(task, AT_ONCE), Metrics()
@@ -164,7 +161,7 @@ class Offline:
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Clone in the first round, and learn by the method. Metrics: the method's, and cloning_loss where it cloned
         (mean over the last pass of the squared distance to a recorded action over twice its variance; of -log pi where
-        actions are discrete or the std is learned).
+        actions are discrete or the std is learned; of the flow-matching loss where the policy is a flow).
 
         Raises ValueError where there is nothing to learn from.
         """
@@ -184,7 +181,9 @@ class Offline:
         weights = {one.like.id: one.demonstration.weight for one in demonstrations}
         metrics = self._clone(material.segments, weights, rng) | self._improve(self, material, reward, rng)
         self._player.rounds += 1
-        self._measured = self._agreement(held) if len(held) else {}
+        # A flow's scores are no log-probabilities: of how judgements agree with it nothing is said.
+        plain = isinstance(self.policy, MLPPolicy) and len(held)
+        self._measured = _agreement(cast(Offline[MLPPolicy], self), held) if plain else {}
         return metrics
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
@@ -195,7 +194,7 @@ class Offline:
         found = self._player.evaluate(self._settings.evaluation_episodes, self._act(None), reward, rng)
         return replace(found, metrics=found.metrics | self._measured)
 
-    def scores(self, logp: Tensor, whose: Integers, before: Integers) -> Tensor:
+    def scores(self: Offline[MLPPolicy], logp: Tensor, whose: Integers, before: Integers) -> Tensor:
         """(S, 1) log-probabilities of segments' steps -> (N,) their discounted sums, each step's against the mode's.
 
         A density has no scale of its own; against the mode's it is a distance, as in the paper's code.
@@ -205,11 +204,19 @@ class Offline:
         return logp.new_zeros(int(whose[-1]) + 1).index_add(0, owners, weights * (logp[:, 0] - self.policy.peak))
 
     def actor(self) -> Actor:
-        actor = self.policy.numpy_actor()
-        return lambda observations, rng, memory: (actor(observations, rng)[1], memory)
+        decide = self.policy.decide()
+
+        def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
+            _, actions, memory = decide(observations, rng, None, memory)
+            return actions, memory
+
+        return act
 
     def save(self, path: Path) -> None:
-        """As a zip of stable-baselines3's PPO, which acts as this policy does."""
+        """As a zip of stable-baselines3's PPO, which acts as this policy does. Raises ConfigError for a flow, of which
+        it has none."""
+        if not isinstance(self.policy, MLPPolicy):
+            raise ConfigError(NO_ZIP.format("flow"))
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
         save_ppo(self.policy, self._task, path)
@@ -234,18 +241,18 @@ class Offline:
                 _check_shown(one, self._task)
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
-        settings, recordings = self._settings, Recordings.of(segments, self.policy)
-        each = np.repeat([weights.get(one.id, 1.0) for one in segments], recordings.lengths)
+        settings, examples = self._settings, self.policy.examples(segments)
+        each = np.repeat([weights.get(one.id, 1.0) for one in segments], [len(one) for one in segments])
         advantages = torch.from_numpy(each.astype(np.float32)[:, None]).to(self.policy.device)
-        steps = gradient.Batch(recordings.decisions, torch.zeros_like(advantages), advantages)
         objective = Objective(clip=None, value=0.0, entropy=0.0, max_grad_norm=settings.max_grad_norm)
         found: list[Metrics] = []
         for _ in range(settings.cloning_epochs):
             parts = shuffled(len(each), settings.cloning_minibatch, rng)
             rows = (torch.from_numpy(at).to(self.policy.device) for at in parts)
+            steps = gradient.Batch(self.policy.redrawn(examples, rng), torch.zeros_like(advantages), advantages)
             found = update(self.policy, self.optimizer, steps, rows, objective)
         # Of a std that stays, a density says nothing: against the mode's it is a distance.
-        beside = 0.0 if self._learns_std else self.policy.peak * float(each.mean())
+        beside = self.policy.ceiling * float(each.mean())
         return {"cloning_loss": float(np.mean([one["loss"] for one in found])) + beside} if found else {}
 
     def descend(
@@ -255,25 +262,33 @@ class Offline:
         some = steps.rows(torch.from_numpy(rows).to(self.policy.device))
         return descend_by_logp(self.policy, self.optimizer, some, loss_of, self._settings.max_grad_norm)
 
-    @torch.no_grad()
-    def _agreement(self, held: Batch[Segment]) -> Metrics:
-        """How held-out judgements agree with the policy's scores."""
-        recordings = Recordings.of(held.candidates, self.policy)
-        _, whose, before = recordings.steps(np.arange(len(held.candidates)))  # in order: the rows are all of them
-        scores = self.scores(self.policy.log_prob(recordings.decisions)[0], whose, before)
-        edges, preference, weight = (
-            torch.from_numpy(x).to(scores.device) for x in (held.edges, held.preference, held.weight)
-        )
-        share, gaps = weight / weight.sum(), scores[edges[:, 0]] - scores[edges[:, 1]]
-        found = {"agreement": float(measured(gaps, preference, share)["accuracy"])}
-        if self._alpha is None:
-            return found
-        losses = torch.nn.functional.binary_cross_entropy_with_logits(self._alpha * gaps, preference, reduction="none")
-        return found | {"judgement_loss": float((share * losses).sum())}
-
     def _act(self, rng: np.random.Generator | None) -> Act:
-        actor = self.policy.numpy_actor()
-        return lambda observations, legal, begins: actor(observations, rng, legal)
+        return Acting(self.policy.decide(), rng)
+
+
+def gaussian(
+    settings: OfflineSettings, task: ControlTask, rng: np.random.Generator, learns_std: bool = False
+) -> MLPPolicy:
+    """The perceptron that these learners learn, with its std as it is set, or learned from there."""
+    network = MLPPolicySettings(hidden=settings.hidden, initial_std=settings.std)
+    return MLPPolicy(network, task, rng, learns_std)
+
+
+@torch.no_grad()
+def _agreement(learner: Offline, held: Batch[Segment]) -> Metrics:
+    """How held-out judgements agree with the policy's scores."""
+    recordings = Recordings.of(held.candidates, learner.policy)
+    _, whose, before = recordings.steps(np.arange(len(held.candidates)))  # in order: the rows are all of them
+    scores = learner.scores(learner.policy.log_prob(recordings.decisions)[0], whose, before)
+    edges, preference, weight = (
+        torch.from_numpy(x).to(scores.device) for x in (held.edges, held.preference, held.weight)
+    )
+    share, gaps = weight / weight.sum(), scores[edges[:, 0]] - scores[edges[:, 1]]
+    found = {"agreement": float(measured(gaps, preference, share)["accuracy"])}
+    if learner.alpha is None:
+        return found
+    losses = torch.nn.functional.binary_cross_entropy_with_logits(learner.alpha * gaps, preference, reduction="none")
+    return found | {"judgement_loss": float((share * losses).sum())}
 
 
 def _check_shown(one: Segment, task: ControlTask) -> None:
@@ -320,4 +335,4 @@ def _data(path: Path | None, task: ControlTask, imitates: bool) -> tuple[Segment
     return found
 
 
-__all__: Sequence[str] = ("Improve", "Material", "Offline", "OfflineSettings", "Recordings", "minibatches")
+__all__: Sequence[str] = ("Improve", "Material", "Offline", "OfflineSettings", "Recordings", "gaussian", "minibatches")

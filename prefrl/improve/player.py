@@ -11,6 +11,11 @@ from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import cut, first_rollout
 from prefrl.types import Evaluation, Segment, State, Steps
 
+NO_ZIP = (
+    "a zip of stable-baselines3's PPO can only hold a policy of kind mlp, and this one is of kind {}: act with it "
+    "through prefrl.load_policy"
+)
+
 
 class Player:
     """The last round's rollout, and how many steps were taken for what. `most` environments are stepped at once."""

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
-from prefrl.envs.experts import EXPERTS
+from prefrl.envs.experts import EXPERTS, MOODS
 from prefrl.judgements import Demonstration
 from prefrl.policies.origin import actor_of
 from prefrl.policies.rollout import whole_episodes
@@ -26,6 +26,8 @@ from prefrl.types import Bools, Floats, Query, Segment
 
 Advice: TypeAlias = Callable[[Floats], Floats]
 """Observations (n, O) -> the expert's actions (n, A), within the bounds, or one-hot."""
+Moods: TypeAlias = Callable[[Floats, Floats], Floats]
+"""The same of an expert who does not act alike in all episodes: it is also given (n,) in [0, 1), drawn for each."""
 
 
 class ExpertSettings(Settings):
@@ -49,7 +51,8 @@ class ExpertSettings(Settings):
             raise ConfigError(
                 f"labeler.noise: of discrete actions it is a share, so expected at most 1, got {self.noise}"
             )
-        return Expert(self, found, advice_of(self.policy, found))
+        moods = MOODS.get(found.name) if self.policy is None else None
+        return Expert(self, found, advice_of(self.policy, found), moods)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Expert:
     settings: ExpertSettings
     task: ControlTask
     advice: Advice
+    moods: Moods | None = None
+    """In its own episodes, where these are not all alike."""
     demonstrates: bool = True
 
     @property
@@ -77,7 +82,7 @@ class Expert:
         missing = self.settings.episodes - self._already(store)
         if missing <= 0:
             return
-        played = play(self.task, self.advice, missing, rng, self.settings)
+        played = play(self.task, self.advice, missing, rng, self.settings, self.moods)
         queries = [Query((one,)) for one in played]
         store.ask(queries)
         # In the same order, so that a round that was killed in between, and is done again, goes on from there.
@@ -120,13 +125,20 @@ def advice_of(policy: Path | None, task: ControlTask) -> Advice:
 
 
 def play(
-    task: ControlTask, advice: Advice, episodes: int, rng: np.random.Generator, settings: ExpertSettings
+    task: ControlTask,
+    advice: Advice,
+    episodes: int,
+    rng: np.random.Generator,
+    settings: ExpertSettings,
+    moods: Moods | None = None,
 ) -> Sequence[Segment]:
     """Whole episodes in which the expert acts, with noise, and which hold what it would have done without."""
-    noise = np.random.default_rng(rng.integers(2**63))
+    noise, mood = np.random.default_rng(rng.integers(2**63)), np.zeros(episodes)
 
     def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
-        clean = advice(observations)
+        if moods is not None:
+            mood[begins] = noise.random(int(begins.sum()))
+        clean = advice(observations) if moods is None else moods(observations, mood)
         return clean, _disturbed(clean, task, settings.noise, noise)
 
     rollout = whole_episodes(task, act, episodes, rng)

@@ -7,7 +7,7 @@ that is trained); one without reads single steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeAlias
 
@@ -16,10 +16,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from prefrl.policies.normaliser import Normaliser
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import I, Policy
 from prefrl.seeding import to_numpy
-from prefrl.types import Bools, Floats, State
+from prefrl.types import Bools, Floats, Segment, State
 
 Memory: TypeAlias = Floats | None
 """(n, M) of n episodes, zeros where one begins; None for a policy that has none, and before the first step."""
@@ -44,6 +45,8 @@ class Reading(Generic[I]):
     """(n, T) what the critic expects at each step."""
     final: Tensor
     """(k,) what it expects of the final observations that it was asked about."""
+    decides: Bools | None = None
+    """(n, T): at which steps something was chosen, each a row of the inputs; None where at every one."""
 
 
 class ControlPolicy(Policy[I], Protocol[I]):
@@ -52,6 +55,10 @@ class ControlPolicy(Policy[I], Protocol[I]):
     @property
     def chunk(self) -> int:
         """How many steps there are in a sequence of the update; 1 for policies that remember nothing."""
+
+    @property
+    def exact(self) -> bool:
+        """Whether log-probabilities are such; else they are only good for ratios, and say nothing of a KL."""
 
     @property
     def device(self) -> torch.device: ...
@@ -71,6 +78,23 @@ class ControlPolicy(Policy[I], Protocol[I]):
 
     def load(self, state: State) -> None:
         """Raises ValueError where shapes differ."""
+
+
+class Clonable(ControlPolicy[I], Protocol[I]):
+    """A policy that can be fitted on what was shown."""
+
+    @property
+    def normaliser(self) -> Normaliser: ...
+
+    @property
+    def ceiling(self) -> float:
+        """The highest log-probability there can be, where that stays what it is; 0 where it does not."""
+
+    def examples(self, segments: Sequence[Segment]) -> I:
+        """What was done in some segments: a sequence for each step, in order."""
+
+    def redrawn(self, examples: I, rng: np.random.Generator) -> I:
+        """The same with new draws, for policies whose log-probabilities hang on some."""
 
 
 Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[Floats, Memory]]
@@ -171,6 +195,7 @@ def copy_into(parameters: dict[str, Tensor], saved: dict[str, Tensor]) -> None:
 
 __all__ = [
     "Acting",
+    "Clonable",
     "ControlPolicy",
     "Decide",
     "Decisions",

@@ -66,7 +66,7 @@ class CNNPolicySettings(HeadSettings):
 class CNNPolicy:
     """A `prefrl.policies.acting.ControlPolicy` of `Decisions`, whose observations are rows of pixels."""
 
-    chunk = 1
+    chunk, exact = 1, True
 
     def __init__(self, settings: CNNPolicySettings, task: ControlTask, rng: np.random.Generator) -> None:
         self.settings, self.space = settings, ActionSpace.of(task, settings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
@@ -30,7 +30,7 @@ from prefrl.policies.perceptron import Activation, Layers, activated, backward, 
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask, PassByHand
 from prefrl.seeding import generator, to_numpy
-from prefrl.types import Bools, Floats, State
+from prefrl.types import Bools, Floats, Segment, State
 
 
 class MLPPolicySettings(HeadSettings):
@@ -86,7 +86,7 @@ class MLPPolicy:
     is the gradient (`by_hand`): for networks this small torch's overhead would be most of the time.
     """
 
-    chunk = 1
+    chunk, exact = 1, True
 
     def __init__(
         self, settings: MLPPolicySettings, task: ControlTask, rng: np.random.Generator, learns_std: bool = True
@@ -175,6 +175,19 @@ class MLPPolicy:
             return 0.0
         assert not self.settings.sde
         return -float(self.named()["log_std"].detach().sum()) - 0.5 * self.space.size * math.log(2 * math.pi)
+
+    @property
+    def ceiling(self) -> float:
+        return 0.0 if self._learns_std else self.peak
+
+    def examples(self, segments: Sequence[Segment]) -> Decisions:
+        observations = self.normalise(np.concatenate([one.observations for one in segments]))
+        choices = self.space.choices(np.concatenate([one.actions for one in segments]))
+        return Decisions(*(torch.from_numpy(x).to(self.device) for x in (observations, choices)))
+
+    def redrawn(self, examples: Decisions, rng: np.random.Generator) -> Decisions:
+        """Nothing was drawn for them."""
+        return examples
 
     def values(self, inputs: Decisions) -> Tensor:
         """(B, 1)."""

@@ -11,6 +11,7 @@ import yaml
 from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
+from prefrl.policies.flow import FlowPolicySettings
 from prefrl.policies.heads import ActionSpace
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings, NumpyActor
 from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, squashes, state_of
@@ -19,6 +20,9 @@ from prefrl.storage.checkpoints import load_state, newest
 from prefrl.types import Json, State
 
 OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and PPO, A2C or TRPO"
+
+OF_NETWORKS = {"kind", "hidden", "critic_hidden", "activation", "chunk"}
+"""Settings of a flow that have to be alike for one to be taken over."""
 
 
 class _Found(NamedTuple):
@@ -29,12 +33,14 @@ class _Found(NamedTuple):
     """Of a run, the task that it is for; a zip does not say."""
 
 
-def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings) -> State:
-    """What `MLPPolicy.load` reads: the last policy of a run, or that of a zip (`read_zip`).
+def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings | FlowPolicySettings) -> State:
+    """What `MLPPolicy.load` or `FlowPolicy.load` reads: the last policy of a run, or that of a zip (`read_zip`).
 
     Raises `ConfigError` for a policy of other spaces, widths or noise, and for what is no policy of control.
     """
     who = "learner.start"
+    if isinstance(settings, FlowPolicySettings):
+        return _flow(path, task, settings)
     found = _found(path, who)
     _check_spaces(found, path, task, who)
     _check_widths(found, path, settings.hidden)
@@ -63,6 +69,30 @@ def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
     return policy.numpy_actor()
 
 
+def _flow(folder: Path, task: ControlTask, settings: FlowPolicySettings) -> State:
+    """The flow of a run. Raises `ConfigError` where it is none, or another one."""
+    if not folder.is_dir():
+        raise ConfigError(
+            f"learner.start: there is no {folder}, seen from {Path.cwd()}; expected the folder of a run with a policy "
+            "of kind flow"
+        )
+    checkpoint, _ = newest(folder)
+    said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
+    there, wanted = said["learner"].get("policy") or {}, settings.model_dump(mode="json")
+    # How a plan is made and measured is no part of the network.
+    other = [name for name in sorted(OF_NETWORKS) if there.get(name) != wanted[name]]
+    if other:
+        theirs, here = ({name: said.get(name) for name in other} for said in (there, wanted))
+        raise ConfigError(
+            f"learner.start: the policy of {folder} has learner.policy {theirs}, and here they are {here}: "
+            "set them alike"
+        )
+    if (found := task_of(said)).name != task.name:
+        raise ConfigError(f"learner.start: expected a policy for {task.name}, and {folder} is a run of {found.name}")
+    state: State = load_state(checkpoint, "learner")["policy"]
+    return state
+
+
 def _found(path: Path, who: str) -> _Found:
     if not path.exists():
         raise ConfigError(f"{who}: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip")
@@ -82,7 +112,7 @@ def _of_run(folder: Path) -> _Found:
     state = load_state(checkpoint, "learner")
     ours, theirs = state.get("policy", {}), state.get("modules", {}).get("policy", {})
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
-    network = said["learner"].get("policy", {})
+    network = said["learner"].get("policy") or {}  # null for the perceptron of a clone
     if ours and (network.get("kind", "mlp"), network.get("activation", "tanh")) != ("mlp", "tanh"):
         raise ConfigError(f"{folder} has another network, {network}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:

@@ -83,6 +83,8 @@ class Chunks:
 class RememberingPolicy:
     """A `prefrl.policies.acting.ControlPolicy` of `Chunks`. Learning is automatic differentiation."""
 
+    exact = True
+
     def __init__(
         self, networks: Networks, p: torch.nn.ParameterDict, task: ControlTask, chunk: int, settings: HeadSettings
     ) -> None:

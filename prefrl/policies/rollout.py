@@ -26,7 +26,7 @@ class Rollout:
     observations: Floats
     """(n, T, O) float32."""
     choices: Floats
-    """(n, T, A) float32: what the policy drew."""
+    """(n, T, A) float32: what the policy drew; of one that plans (n, T, M), all that it remembers."""
     actions: Floats
     """(n, T, A) float32: what was executed."""
     final_observations: Floats

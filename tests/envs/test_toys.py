@@ -7,7 +7,7 @@ import pytest
 
 from prefrl import Config
 from prefrl.components import ConfigError
-from prefrl.envs.toys import INK, MARK, PointSettings, TMazeSettings
+from prefrl.envs.toys import INK, MARK, ForkSettings, PointSettings, TMazeSettings
 from prefrl.store import Store
 from prefrl.types import Segment
 
@@ -40,6 +40,28 @@ def test_a_picture_shows_the_point_and_the_middle() -> None:
     assert tuple(frames[1, 45, 15]) == INK
     with pytest.raises(ValueError, match="simulator states"):
         task.frames(Segment(segment.observations, segment.actions, "e", 0))
+
+
+def test_who_hits_the_disc_stays_there_and_the_goal_counts_once_on_the_wanted_side(rng: np.random.Generator) -> None:
+    for side, expected in (("either", 1.0), ("left", 1.0), ("right", 0.0)):
+        world = ForkSettings.model_validate({"side": side}).build().world
+        states = np.array([[0.0, -0.65, 0, 0], [-0.7, -0.02, 0, 0], [0.1, 0.8, 0, -1.0]])
+        up = np.tile([0.0, 1.0], (3, 1))
+        after, gold, ended = world.advance(states, up, rng)
+        assert after[:, 2].tolist() == [-1, 0, 1]
+        assert after[1, 3] == -1  # abreast of the disc, on its left
+        assert gold.tolist() == [0, 0, expected]
+        assert not ended.any()
+        again, gold, _ = world.advance(after, up, rng)
+        np.testing.assert_array_equal(again[[0, 2]], after[[0, 2]])
+        assert gold[[0, 2]].tolist() == [0, 0]
+
+
+def test_a_picture_of_the_fork_shows_the_disc_the_goal_and_the_point() -> None:
+    picture = ForkSettings().build().world.picture(np.array([-1.0, -1.0, 0, 0]), 90)
+    assert tuple(picture[45, 45]) == (150, 150, 150)
+    assert tuple(picture[15, 45]) == MARK
+    assert tuple(picture[75, 15]) == INK
 
 
 def test_a_segment_longer_than_the_episode_is_refused() -> None:

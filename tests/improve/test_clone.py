@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 from control_stubs import Known, point
 
 from prefrl import Config, Run, load_policy
+from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
@@ -21,6 +23,8 @@ from prefrl.improve.offline import Offline, Recordings
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.expert import Advice, Expert, ExpertSettings
 from prefrl.protocols import Store as Kept
+from prefrl.rundir import RunError
+from prefrl.stages import export_onnx, export_sb3
 from prefrl.store import Store
 from prefrl.types import Floats, Query, Segment, State
 
@@ -264,3 +268,40 @@ def test_only_what_was_shown_is_cloned_and_not_what_was_judged(tmp_path: Path) -
     (recorded,) = recording(tmp_path).segments
     np.testing.assert_array_equal(recorded.actions, like.actions)
     assert np.abs(one.actor()(seen, None, None)[0] - like.actions).mean() < 0.2
+
+
+FLOW: dict[str, Any] = {"kind": "flow", "hidden": [16], "critic_hidden": [4], "chunk": 2, "execute": 2, "draws": 2}
+
+
+def test_a_flow_is_cloned_alike_from_the_same_seed_and_goes_on_alike_after_a_stop(tmp_path: Path) -> None:
+    task, store = point(), shown(tmp_path, point(), to_the_middle, episodes=4)
+    changes = {"policy": FLOW, "cloning_epochs": 40, "learning_rate": 1e-2}
+    one, same = (CloneSettings.model_validate(changes).build(task, np.random.default_rng(0)) for _ in range(2))
+    first = one.improve(cast(Any, Known()), store, np.random.default_rng(0))
+    same.load(deepcopy(one.state()))
+    second = [each.improve(cast(Any, Known()), store, np.random.default_rng(1)) for each in (one, same)]
+    assert second[0] == second[1]
+    assert second[0]["cloning_loss"] < first["cloning_loss"]
+    for name, weights in one.policy.state()["parameters"].items():
+        assert torch.equal(weights, same.policy.state()["parameters"][name])
+
+
+def test_a_learner_starts_from_a_cloned_flow_and_what_cannot_hold_one_is_said(tmp_path: Path) -> None:
+    flow = [f"learner.policy={json.dumps(FLOW)}", "learner.cloning_epochs=1", "labeler.episodes=1"]
+    with Run(Config.load("control/fork-flow", [*flow, "learner.evaluation_episodes=1"]), tmp_path / "clone") as run:
+        list(run)
+    settings = {"start": tmp_path / "clone", "policy": FLOW}
+    task, seen = run.loop.task, np.random.default_rng(0).normal(0.0, 1.0, (20, 2)).astype(np.float32)
+    learner = ControlLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
+    expected, memory = load_policy(tmp_path / "clone").predict(seen)
+    assert memory is not None
+    learner.policy.observe(seen)  # nothing has moved its statistics before it starts, and nothing does after
+    found, _ = learner.actor()(seen, None, None)
+    np.testing.assert_array_equal(found, expected)
+    other = ControlLearnerSettings.model_validate(settings | {"policy": FLOW | {"chunk": 3}})
+    with pytest.raises(ConfigError, match=r"has learner.policy \{'chunk': 2\}, and here they are \{'chunk': 3\}"):
+        other.build(task, np.random.default_rng(0)).actor()
+    with pytest.raises(ConfigError, match=r"only hold a policy of kind mlp, .* kind flow.*load_policy"):
+        export_sb3(tmp_path / "clone", tmp_path / "policy.zip")
+    with pytest.raises(RunError, match=r"learner\.kind=control"):
+        export_onnx(tmp_path / "clone", tmp_path / "policy.onnx")

@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -260,3 +261,20 @@ def test_what_was_not_scored_is_in_no_baseline() -> None:
     torch.testing.assert_close(o.group_normalised(scores)[:1, :2], two)
     torch.testing.assert_close(o.batch_scaled(scores)[0], torch.tensor([-1.0, 1.0, 0.0]) / (2 + 1e-4))
     assert o.all_equal(scores).tolist() == [False, True]
+
+
+def test_a_trace_of_one_within_plans_makes_decisions_of_them() -> None:
+    """Plans of 2, 3 and 1 steps: advantages are those of three decisions, whose rewards are sums over their steps."""
+    rng, discount, trace = np.random.default_rng(0), 0.9, 0.8
+    rewards, values = rng.normal(size=(1, 6)), rng.normal(size=(1, 7))
+    into = np.array([[1.0, trace, 1.0, 1.0, trace, trace]])  # what each step leads to: within a plan, or a new one
+    ends = torch.zeros(1, 6, dtype=torch.bool)
+    given, here, following = (torch.from_numpy(x) for x in (rewards, values[:, :-1], values[:, 1:]))
+    found = o.gae(given, here, following, ends, discount, torch.from_numpy(into))[0, [0, 2, 5]]
+    expected, running = [], 0.0
+    for start, steps in ((5, 1), (2, 3), (0, 2)):
+        reward = sum(discount**k * rewards[0, start + k] for k in range(steps))
+        delta = reward + discount**steps * values[0, start + steps] - values[0, start]
+        running = delta + discount**steps * trace * running
+        expected.append(running)
+    np.testing.assert_allclose(found, expected[::-1], rtol=1e-9)

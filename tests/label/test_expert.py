@@ -13,6 +13,7 @@ from prefrl.components import ConfigError
 from prefrl.config import Config
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.experts import EXPERTS
+from prefrl.envs.toys import ForkSettings
 from prefrl.improve.clone import CloneSettings
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.demonstrator import DemonstratorSettings
@@ -49,6 +50,16 @@ def test_whole_episodes_are_shown_once_and_stand_for_themselves(pendulum: Contro
         assert [len(one.like) for one in shown] == [20, 20, 20]
         assert all(one.like.id == one.query.candidates[0].id for one in shown)
         assert store.counts() == {"asked": 3, "answered": 3, "skipped": 0}
+
+
+def test_an_expert_who_goes_one_way_or_another_keeps_to_it_for_an_episode(tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store:
+        expert(ForkSettings().build(), episodes=12).answer(store, np.random.default_rng(0))
+        shown = [one.like for one in store.demonstrations()]
+        assert [float(gold.sum()) for gold in store.gold(shown)] == [1.0] * 12
+    sides = [np.sign(one.observations[10:25, 0]) for one in shown]
+    assert all((side == side[0]).all() for side in sides)
+    assert 3 <= sum(side[0] > 0 for side in sides) <= 9
 
 
 def test_the_learners_states_are_answered_with_the_experts_actions(pendulum: ControlTask, tmp_path: Path) -> None:
@@ -168,7 +179,7 @@ def test_how_many_are_asked_about_must_fit_the_labeler(tmp_path: Path, settings:
 
 def test_a_task_without_an_expert_asks_for_a_policy() -> None:
     task = ControlSettings.model_validate({"env": "CartPole-v1"}).build()
-    with pytest.raises(ConfigError, match="no expert is known for CartPole-v1, only for Pendulum-v1: name a run"):
+    with pytest.raises(ConfigError, match="no expert is known for CartPole-v1, only for Pendulum-v1, fork: name a run"):
         expert(cast("ControlTask", task))
 
 
