@@ -268,6 +268,15 @@ class Demonstrates(Protocol):
     def demonstrates(self) -> bool: ...
 
 
+@runtime_checkable
+class Advises(Protocol):
+    """A labeler that can tell what it would do in any state of control: a policy is measured beside it."""
+
+    @property
+    def advice(self) -> Callable[[Floats], Floats]:
+        """Observations (n, O) -> actions (n, A), within the bounds, or one-hot."""
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 
@@ -324,7 +333,7 @@ class Store(Judgements[C], Protocol[C]):
         """Take a labeler's answer back; the log keeps both."""
 
     def counts(self) -> dict[str, int]:
-        """Queries asked, answered, skipped."""
+        """Queries asked, answered, skipped; and demonstrations among the answers, where there are any."""
 
     def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
         """Which of these queries and candidates had been asked about by then."""

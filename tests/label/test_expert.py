@@ -48,7 +48,7 @@ def test_whole_episodes_are_shown_once_and_stand_for_themselves(pendulum: Contro
         shown = store.demonstrations()
         assert [len(one.like) for one in shown] == [20, 20, 20]
         assert all(one.like.id == one.query.candidates[0].id for one in shown)
-        assert store.counts() == {"asked": 3, "answered": 3, "skipped": 0}
+        assert store.counts() == {"asked": 3, "answered": 3, "skipped": 0, "demonstrations": 3}
 
 
 def test_the_learners_states_are_answered_with_the_experts_actions(pendulum: ControlTask, tmp_path: Path) -> None:
