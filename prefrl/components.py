@@ -79,6 +79,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "tmaze": "prefrl.envs.toys:TMazeSettings",
     },
     "labelers": {
+        "author": "prefrl.label.author:AuthorSettings",
         "crowd": "prefrl.label.crowd:CrowdSettings",
         "demonstrator": "prefrl.label.demonstrator:DemonstratorSettings",
         "expert": "prefrl.label.expert:ExpertSettings",

@@ -205,6 +205,14 @@ class TextTask(Task, Protocol):
         """(N,) 1 where a response is well formed, else 0; None where the task cannot tell."""
 
 
+@runtime_checkable
+class Authored(TextTask, Protocol):
+    """A task of text that can write texts of its own, by a grammar say."""
+
+    def written(self, count: int, rng: np.random.Generator) -> list[Response]:
+        """So many responses, each to a prompt of its own, of those to learn; without gold."""
+
+
 def control(task: Task, what: str) -> ControlTask:
     """A task, known to be of control. Raises `ConfigError` for others; `what` says who needs it and for what."""
     if task.kind != SEGMENTS.name:
