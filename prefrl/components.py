@@ -75,6 +75,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
         "segments": "prefrl.envs.segments:SegmentsSettings",
+        "several": "prefrl.envs.several:SeveralSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
         "tmaze": "prefrl.envs.toys:TMazeSettings",
     },

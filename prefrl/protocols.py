@@ -16,7 +16,21 @@ from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Demonstrated, Judged
 from prefrl.kinds import RESPONSES, SEGMENTS
 from prefrl.seeding import Device
-from prefrl.types import Bools, C, C_contra, Evaluation, Fields, Floats, Metrics, Query, Response, Segment, State, Steps
+from prefrl.types import (
+    Bools,
+    C,
+    C_contra,
+    Evaluation,
+    Fields,
+    Floats,
+    Integers,
+    Metrics,
+    Query,
+    Response,
+    Segment,
+    State,
+    Steps,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -158,6 +172,17 @@ class Parted(Protocol):
 
         They draw from the generator of `reset` what all of them would. None where that cannot be, or does not pay.
         """
+
+
+@runtime_checkable
+class Mixed(Protocol):
+    """A task of control that is several, of which each episode is of one."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def which(self, observations: Floats) -> Integers:
+        """(n, O) observations -> (n,) which of the tasks each is of."""
 
 
 @runtime_checkable

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from itertools import accumulate, cycle
 
 from markupsafe import Markup
 
@@ -14,11 +14,13 @@ from prefrl.evaluate.summary import STAGES
 from prefrl.report import plots
 from prefrl.report.facts import Facts
 from prefrl.report.plots import Line, Series
-from prefrl.report.records import Record, whole
+from prefrl.report.records import Record, visible, whole
 from prefrl.report.words import show_count, show_number
 from prefrl.stats.estimates import Estimate
 
 ROUNDING = 1e-9
+TASKS = ("gold", "learned", "improve", "label", "evaluate", "ink")
+"""Colours of several tasks, by turns."""
 INTERVAL = 1.96
 """Standard errors on each side of a mean."""
 TRAINING = {
@@ -75,7 +77,7 @@ def _known(values: Series) -> bool:
 
 
 def _learning(record: Record, facts: Facts) -> tuple[Card, ...]:
-    gold = (_gold(record),) if _known(record.series("evaluate/gold")) or not facts.finished else ()
+    gold = (_gold(record), *_golds(record)) if _known(record.series("evaluate/gold")) or not facts.finished else ()
     if record.hindsight is None:
         return (*gold, _learned_then(record, facts))
     agreement = (_agreement(record),) if gold else ()
@@ -105,6 +107,17 @@ def _gold(record: Record) -> Card:
         "The task's own value of fresh behaviour, which nothing that learns may read: up is better. "
         f"The band is the {band}.{said}",
     )
+
+
+def _golds(record: Record) -> tuple[Card, ...]:
+    """Of each of several tasks."""
+    mark = "evaluate/gold/"
+    names = sorted({key.removeprefix(mark) for line in record.rounds for key in line if key.startswith(mark)})
+    shades = zip(names, cycle(TASKS), strict=False)
+    curves = [Line(record.series(mark + name), colour, visible(name, 40)) for name, colour in shades]
+    drawn = plots.lines("golds", record.numbers, curves) if curves else Markup("")
+    reading = "The mean of the episodes of each task. What is called gold elsewhere is the mean of these."
+    return (Card("Gold of each task", drawn, reading),) if drawn else ()
 
 
 def _by_newest(found: Hindsight, facts: Facts) -> tuple[Card, ...]:

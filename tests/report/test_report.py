@@ -271,6 +271,15 @@ def test_mistakes_are_added_up_beside_the_lines_of_the_measured_eps(tmp_path: Pa
     assert "shift.json: cannot be read" in page(folder).text
 
 
+def test_each_of_several_tasks_has_a_curve(tmp_path: Path) -> None:
+    lines = [line(i, **{"evaluate/gold/mars": 1.0 * i, "evaluate/gold/<blink>earth": -1.0}) for i in range(4)]
+    found = page(run_folder(tmp_path / "run", lines, summary=summary()))
+    assert "Gold of each task" in found.text
+    assert "mars" in found.text
+    assert "<blink>earth" in found.text
+    assert "blink" not in found.tags
+
+
 def test_a_folder_of_demonstrations_alone_says_how_many_there_are(tmp_path: Path) -> None:
     (tmp_path / "labels.json").write_text(json.dumps({"asked": 4, "answered": 4, "skipped": 0, "demonstrations": 4}))
     found = page(tmp_path)
