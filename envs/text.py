@@ -87,6 +87,15 @@ class Reviews:
     def evaluation_prompts(self, count: int, rng: np.random.Generator) -> list[str]:
         return self._draw(count, rng, evaluation=True)
 
+    def written(self, count: int, rng: np.random.Generator) -> list[Response]:
+        """Reviews by the grammar, good and bad, that begin with prompts to learn."""
+        found: list[Response] = []
+        while len(found) < count:
+            prompt, rest = self._grammar.sample(rng)
+            if not is_for_evaluation(prompt):
+                found.append(Response(prompt, rest))
+        return found
+
     def gold(self, responses: Sequence[Response]) -> Floats:
         """(N,) VADER's compound score in [-1, 1] (Hutto and Gilbert 2014) of the whole review; or, by the rubric, the
         share of what it does, in [0, 1].

@@ -77,10 +77,12 @@ TABLE: dict[Role, dict[str, str]] = {
         "point": "prefrl.envs.toys:PointSettings",
         "reviews": "prefrl.envs.text:ReviewsSettings",
         "segments": "prefrl.envs.segments:SegmentsSettings",
+        "several": "prefrl.envs.several:SeveralSettings",
         "texts": "prefrl.envs.texts:TextsSettings",
         "tmaze": "prefrl.envs.toys:TMazeSettings",
     },
     "labelers": {
+        "author": "prefrl.label.author:AuthorSettings",
         "crowd": "prefrl.label.crowd:CrowdSettings",
         "demonstrator": "prefrl.label.demonstrator:DemonstratorSettings",
         "expert": "prefrl.label.expert:ExpertSettings",

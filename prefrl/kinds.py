@@ -113,9 +113,21 @@ def _are_text(*values: object) -> bool:
 # --- segments -------------------------------------------------------------------------------------------------------
 
 
+def _describe_segment(one: Segment) -> Json:
+    place = {"context": one.context} if one.context else {}  # as it was before there were any
+    return {"episode": one.episode, "start": one.start, "steps": len(one)} | place
+
+
 def _load_segment(body: Fields, read: Callable[[], Arrays]) -> Segment:
     x = read()
-    return Segment(x["observations"], x["actions"], body["episode"], body["start"], x.get("states"))
+    return Segment(
+        x["observations"],
+        x["actions"],
+        body["episode"],
+        body["start"],
+        x.get("states"),
+        context=body.get("context", ""),
+    )
 
 
 def _segment_arrays(one: Segment) -> Arrays:
@@ -126,6 +138,8 @@ def _segment_arrays(one: Segment) -> Arrays:
 def _segment_fault(one: Segment) -> str:
     if not _are_text(one.episode):
         return f"is not described as it is: its episode is {one.episode!r:.40}; expected text"
+    if not _are_text(one.context):
+        return f"is not described as it is: its context is {one.context!r:.40}; expected text"
     if not is_whole(one.start, LARGEST):
         return f"starts at step {one.start!r:.40}; expected a number from 0 on"
     for name, array in (("observations", one.observations), ("actions", one.actions)):
@@ -148,14 +162,14 @@ def _segments_overlap(a: Segment, b: Segment) -> bool:
 def _half_segment(one: Segment) -> Segment:
     half = max(1, len(one) // 2)
     states = None if one.states is None else one.states[:half]
-    return Segment(one.observations[:half], one.actions[:half], one.episode, one.start, states)
+    return Segment(one.observations[:half], one.actions[:half], one.episode, one.start, states, context=one.context)
 
 
 SEGMENTS = Kind(
     name="control",
     candidate=Segment,
     noun="segment",
-    describe=lambda one: {"episode": one.episode, "start": one.start, "steps": len(one)},
+    describe=_describe_segment,
     load=_load_segment,
     arrays=_segment_arrays,
     fault=_segment_fault,

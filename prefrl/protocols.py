@@ -16,7 +16,21 @@ from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Demonstrated, Judged
 from prefrl.kinds import RESPONSES, SEGMENTS
 from prefrl.seeding import Device
-from prefrl.types import Bools, C, C_contra, Evaluation, Fields, Floats, Metrics, Query, Response, Segment, State, Steps
+from prefrl.types import (
+    Bools,
+    C,
+    C_contra,
+    Evaluation,
+    Fields,
+    Floats,
+    Integers,
+    Metrics,
+    Query,
+    Response,
+    Segment,
+    State,
+    Steps,
+)
 
 if TYPE_CHECKING:
     import torch
@@ -161,6 +175,17 @@ class Parted(Protocol):
 
 
 @runtime_checkable
+class Mixed(Protocol):
+    """A task of control that is several, of which each episode is of one."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    def which(self, observations: Floats) -> Integers:
+        """(n, O) observations -> (n,) which of the tasks each is of."""
+
+
+@runtime_checkable
 class Recorded(Protocol):
     """A task of control whose simulator is not there: its behaviours are those of a file."""
 
@@ -212,6 +237,14 @@ class TextTask(Task, Protocol):
 
     def fluency(self, responses: Sequence[Response]) -> Floats | None:
         """(N,) 1 where a response is well formed, else 0; None where the task cannot tell."""
+
+
+@runtime_checkable
+class Authored(TextTask, Protocol):
+    """A task of text that can write texts of its own, by a grammar say."""
+
+    def written(self, count: int, rng: np.random.Generator) -> list[Response]:
+        """So many responses, each to a prompt of its own, of those to learn; without gold."""
 
 
 def control(task: Task, what: str) -> ControlTask:
@@ -277,6 +310,15 @@ class Demonstrates(Protocol):
     def demonstrates(self) -> bool: ...
 
 
+@runtime_checkable
+class Advises(Protocol):
+    """A labeler that can tell what it would do in any state of control: a policy is measured beside it."""
+
+    @property
+    def advice(self) -> Callable[[Floats], Floats]:
+        """Observations (n, O) -> actions (n, A), within the bounds, or one-hot."""
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 
@@ -333,7 +375,7 @@ class Store(Judgements[C], Protocol[C]):
         """Take a labeler's answer back; the log keeps both."""
 
     def counts(self) -> dict[str, int]:
-        """Queries asked, answered, skipped."""
+        """Queries asked, answered, skipped; and demonstrations among the answers, where there are any."""
 
     def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
         """Which of these queries and candidates had been asked about by then."""

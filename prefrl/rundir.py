@@ -22,9 +22,11 @@ from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
 from prefrl.evaluate.hindsight import hindsight, keep, keep_in, read_from
 from prefrl.evaluate.provenance import made_with
+from prefrl.evaluate.shift import Yardstick, keep_mistakes
 from prefrl.evaluate.summary import Origin, read_metrics, read_summary, summarise
+from prefrl.judgements import Judged
 from prefrl.loop import Loop
-from prefrl.protocols import Attended, Noted, RewardModel, Task
+from prefrl.protocols import Acts, Advises, Attended, Noted, RewardModel, Task, control
 from prefrl.ranks import lead, rounds, shared
 from prefrl.report.examples import save_examples, score_examples
 from prefrl.report.report import write_report
@@ -77,6 +79,7 @@ class Run:
             self._rows = self._restore()
             self._origin = self._found_origin(asked)
             self._probes = [row for row in read_probes(self.folder) if row["round"] <= self.loop.round]
+            self._yardstick: Yardstick | None = None
             self._trackers = Trackers(self.folder, config.model_dump(mode="json"), config.track, self.loop.round)
             opened.callback(self._trackers.close)
             if isinstance(self.loop.labeler, Attended):
@@ -192,16 +195,34 @@ class Run:
         self._save_examples(round)
         if round.evaluated:
             keep(self.folder, round.number, round.evaluated)
+            self._measure_mistakes(round)
         self._trackers.log(round.number, round.metrics)
         self._checkpoint(round.number)
 
     def _score_probes(self, number: int) -> None:
         """The scores of the first judged candidates, the same ones in every round: how far does a refit move them?"""
-        ids = self._probes[0]["candidates"] if self._probes else first_judged(self.store.judged())
+        ids = self._probes[0]["candidates"] if self._probes else first_judged(self._fitted_on())
         scores = self.loop.reward.score([self.store.candidate(id) for id in ids])
         row = {"round": number, "scores": [float(score) for score in scores]}
         self._probes.append(row if self._probes else row | {"candidates": ids})
         write_file(self.folder / "probes.jsonl", "".join(json.dumps(r) + "\n" for r in self._probes).encode())
+
+    def _fitted_on(self) -> list[Judged]:
+        """What was judged; where nothing was, what demonstrations imply."""
+        implied = (one.implied(1.0) for one in self.store.demonstrations())
+        return self.store.judged() or [one for one in implied if one is not None]
+
+    def _measure_mistakes(self, round: Round) -> None:
+        """How far the policy is from the expert, where one answers: it plays once, and nothing learns from that."""
+        loop = self.loop
+        if not isinstance(loop.labeler, Advises) or not isinstance(loop.learner, Acts):
+            return
+        episodes, task = len(round.evaluated), control(loop.task, "an expert advises in control")
+        if self._yardstick is None:
+            rng = streams(self.config.seed, 0).evaluate
+            self._yardstick = Yardstick.of(task, loop.labeler.advice, episodes, rng)
+        found = self._yardstick.mistakes(round.number, loop.learner, round.evaluated)
+        keep_mistakes(self.folder, found, episodes, task.horizon)
 
     def _save_examples(self, round: Round) -> None:
         """A few candidates to look at, of the starting policy and of the newest one."""

@@ -272,11 +272,14 @@ class Store(Generic[C]):
         return [read_arrays(self.folder / "gold", c.id)["gold"] for c in candidates]
 
     def counts(self) -> dict[str, int]:
-        """How many queries were asked, how many judgements and how many skips stand."""
+        """How many queries were asked, how many answers and how many skips stand; and of the answers, where there are
+        any, how many are demonstrations."""
         columns = (sql.func.count(), sql.func.sum(asked.c.judged), sql.func.sum(asked.c.skipped + asked.c.incomparable))
         with self.log.reading() as connection:
             numbers = connection.execute(sql.select(*columns).where(asked.c.purpose == "label")).one()
-        return dict(zip(("asked", "answered", "skipped"), (int(n or 0) for n in numbers), strict=True))
+            shown = connection.scalar(sql.select(sql.func.count()).where(standing.c.kind == "demonstration"))
+        counts = dict(zip(("asked", "answered", "skipped"), (int(n or 0) for n in numbers), strict=True))
+        return counts | ({"demonstrations": int(shown)} if shown else {})
 
     def progress(self) -> tuple[int, int, int]:
         """How many queries were asked, how many of them have a judgement, and how many have nothing but skips."""

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -68,8 +68,8 @@ class Segment:
     gold: Floats | None = None
     """(T,) the task's own rewards. Hidden: the store keeps it apart, nothing that learns may read it."""
 
-    context: Literal[""] = ""
-    """Candidates of one context may be compared; every segment may be compared with every other."""
+    context: str = ""
+    """Candidates of one context may be compared: its task's name where there are several, else all segments."""
 
     def __post_init__(self) -> None:
         if self.observations.ndim != 2 or self.actions.ndim != 2 or len(self.observations) != len(self.actions):

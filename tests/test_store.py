@@ -274,8 +274,9 @@ def test_demonstrations_come_back_with_what_they_show_and_close_their_queries(te
     assert second.like.id == itself.id
     assert text_store.judged() == []
     assert [q.id for q in text_store.open_queries()] == [asked[2].id]
-    assert text_store.counts() == {"asked": 3, "answered": 2, "skipped": 0}
+    assert text_store.counts() == {"asked": 3, "answered": 2, "skipped": 0, "demonstrations": 2}
     text_store.retract(asked[0].id, "ann")
+    assert text_store.counts() == {"asked": 3, "answered": 1, "skipped": 0, "demonstrations": 1}
     assert [one.like.id for one in text_store.demonstrations()] == [itself.id]
     check_rebuilt(text_store)
 

@@ -1,5 +1,5 @@
-"""What a report card of a reward model says, and what it says of a run's rounds: plain data, as it lies in `card.json`
-and `hindsight.json`. What is not defined says why."""
+"""What a report card of a reward model says, and what it says of a run's rounds: plain data, as it lies in `card.json`,
+`hindsight.json` and `shift.json`. What is not defined says why."""
 
 from __future__ import annotations
 
@@ -53,6 +53,8 @@ class About(Part):
     """Pairs that the judgements imply, ties included."""
     ties: int
     candidates: int
+    demonstrations: int = 0
+    """What the fit counted beside them: each says that what was shown is better than what it answers."""
 
 
 class Lengths(Part):
@@ -199,3 +201,25 @@ class Hindsight(Part):
     fitted_round: int | None
     """The round of its fit; None for a reward that the run began with."""
     rounds: tuple[Seen, ...]
+
+
+class Mistakes(Part):
+    """A round's policy beside the expert. An error is 0 for the expert's action, and at most 1."""
+
+    round: int
+    eps: Number
+    """Mean error in the states of the expert's own fresh episodes."""
+    error: Points
+    """Mean error at each step of the policy's own episodes that have got so far."""
+    running: Points
+    """The share of its episodes that have."""
+
+
+class Shift(Part):
+    """How a run's policies are beside an expert, in the order of rounds."""
+
+    episodes: int
+    """Of the policy's own, in each round, and of the expert's."""
+    every: int
+    """Steps that a point is the mean of."""
+    rounds: tuple[Mistakes, ...]

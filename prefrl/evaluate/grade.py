@@ -73,6 +73,8 @@ class Subject:
     probes: Sequence[Json] = ()
     """Rows of `probes.jsonl`."""
     habits: Habits = field(default_factory=Habits)
+    demonstrations: int = 0
+    """That the fit counted; they are not graded on."""
 
 
 def grade(subject: Subject, rng: np.random.Generator) -> ReportCard:
@@ -138,7 +140,14 @@ def of_run(
         round=round,
         probes=[row for row in read_probes(folder) if row["round"] <= round],
         habits=habits(fitting, rows),
+        demonstrations=_counted(rows),
     )
+
+
+def _counted(rows: Sequence[Fields]) -> int:
+    """Demonstrations in the newest fit."""
+    newest: Fields = next((row for row in reversed(rows) if row.get("fit/loss") is not None), {})
+    return int(newest.get("fit/shown") or 0)
 
 
 def of_judgements(
@@ -238,6 +247,7 @@ def _about(subject: Subject, pairs: Pairs, candidates: Sequence[Candidate]) -> A
         comparisons=len(pairs),
         ties=len(pairs) - len(pairs.decided),
         candidates=len(candidates),
+        demonstrations=subject.demonstrations,
     )
 
 

@@ -12,10 +12,10 @@ import torch
 
 from prefrl.distributed import world
 from prefrl.policies.rollout import Rollout, learned_rewards, step_rewards
-from prefrl.protocols import ControlTask, RewardModel
-from prefrl.sample.segments import segment
+from prefrl.protocols import ControlTask, Mixed, RewardModel
+from prefrl.sample.segments import placed, segment
 from prefrl.seeding import to_numpy
-from prefrl.types import Evaluation, Floats, Integers, Response, Segment
+from prefrl.types import Evaluation, Floats, Integers, Metrics, Response, Segment
 
 if TYPE_CHECKING:  # a control learner loads no transformers
     from prefrl.policies.language import LanguagePolicy
@@ -42,7 +42,16 @@ def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]
         "learned": float(learned.mean()),
         "length": float(lengths.mean()),
     }
-    return Evaluation(metrics, tuple(examples), candidates=whole)
+    if isinstance(task, Mixed):
+        metrics |= _by_task(task, rollout, gold)
+    return Evaluation(metrics, tuple(placed(task, examples)), candidates=tuple(placed(task, whole)))
+
+
+def _by_task(task: Mixed, rollout: Rollout, gold: Floats) -> Metrics:
+    """The mean gold of the episodes of each task that has any, and the mean of these."""
+    which = task.which(rollout.observations[:, 0])
+    found = {name: float(gold[which == at].mean()) for at, name in enumerate(task.names) if (which == at).any()}
+    return {"gold": float(np.mean(list(found.values())))} | {f"gold/{name}": mean for name, mean in found.items()}
 
 
 class Returns(NamedTuple):

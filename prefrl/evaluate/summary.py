@@ -53,6 +53,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin) -> Json:
     first, last = (rows[0], rows[-1]) if rows else ({}, {})
     gold = [row["evaluate/gold"] for row in rows if row.get("evaluate/gold") is not None]
     seconds = {stage: sum(row.get(f"seconds/{stage}") or 0.0 for row in rows) for stage in STAGES}
+    counted = ("asked", "answered", "skipped", *(["demonstrations"] if "label/demonstrations" in last else []))
     accuracies = [row["fit/accuracy_held_out"] for row in rows if row.get("fit/accuracy_held_out") is not None]
     return {
         "task": task.name,
@@ -62,7 +63,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin) -> Json:
         "gold_before": first.get("evaluate/gold"),
         "gold_after": last.get("evaluate/gold"),
         "gold_best": max(gold, default=None),
-        "labels": {name: int(last.get(f"label/{name}", 0)) for name in ("asked", "answered", "skipped")},
+        "labels": {name: int(last.get(f"label/{name}", 0)) for name in counted},
         "steps": {name: int(last.get(f"steps/{name}", 0)) for name in ("learn", "query", "evaluate")},
         "reward_accuracy": accuracies[-1] if accuracies else None,
         "kl": last.get("evaluate/kl"),

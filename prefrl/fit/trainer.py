@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -47,7 +47,7 @@ def fit(
         unjudged = list(unjudged) + waiting
     shown = _implied(store.demonstrations(snapshot), fitting.demonstrations) if fitting.demonstrations else []
     shown, judged = shown[-(fitting.newest or 0) :], store.judged(snapshot)[-(fitting.newest or 0) :]
-    fitted = fit_judged(reward, [*judged, *shown], fitting, rng, unjudged)
+    fitted = fit_judged(reward, [*judged, *shown], fitting, rng, unjudged, len(shown))
     fitted.metrics["snapshot"] = float(snapshot)
     return replace(fitted, metrics=fitted.metrics | {"shown": float(len(shown))}) if shown else fitted
 
@@ -63,8 +63,12 @@ def fit_judged(
     fitting: FittingSettings,
     rng: np.random.Generator,
     unjudged: Sequence[C] = (),
+    shown: int = 0,
 ) -> Fitted:
-    """Fit `reward` on judgements at hand. Raises as `fit` does, and FloatingPointError where a score is not finite."""
+    """Fit `reward` on judgements at hand. Raises as `fit` does, and FloatingPointError where a score is not finite.
+
+    The last `shown` of them are what demonstrations imply, and are measured apart where there are others.
+    """
     if not judged:
         raise NothingToFit("there are no judgements to fit on; expected at least one that prefers a candidate")
     if not prefers(judged):
@@ -83,7 +87,12 @@ def fit_judged(
         raise
     scores = reward.settle(problem.stacked, problem.total)
     _check_finite(scores, problem.candidates)
-    return _finish(problem, data, held_out[data.group], scores, epochs)
+    fitted = _finish(problem, data, held_out[data.group], scores, epochs)
+    if not 0 < shown < len(judged):
+        return fitted
+    implied = np.arange(len(judged)) >= len(judged) - shown
+    apart = {"judged": ~implied, "shown": implied}
+    return replace(fitted, metrics=fitted.metrics | _contributions(problem, data, held_out, scores, apart))
 
 
 def _problem(
@@ -138,6 +147,29 @@ def _finish(problem: Problem[C], data: Batch[C], out: np.ndarray, scores: Tensor
     if len(problem.test.labeler):
         metrics |= _measure(problem, problem.test, test, scores, "_held_out")
     return Fitted(metrics, answering.of(test.group).expected(logits), test.preference)
+
+
+def _contributions(
+    problem: Problem[C],
+    data: Batch[C],
+    out: np.ndarray,
+    scores: Tensor,
+    apart: Mapping[str, np.ndarray],
+) -> Metrics:
+    """What each kind of answer had in a fit: how many were trained on, their weight and their share of the loss, and
+    how many were held out, with the accuracy on them. `out` and each of `apart` are (J,) masks of the answers."""
+    found, totals = Metrics(), dict[str, float]()
+    for name, kind in apart.items():
+        part = problem.every.subset(torch.as_tensor(kind & ~out, device=problem.every.labeler.device))
+        weight = float(torch.cat([part.choices.weight, part.ratings.weight]).sum())
+        totals[name] = weight * ensemble_loss(problem, part, scores) if weight else 0.0
+        test = data.subset((kind & out)[data.group])
+        found |= {f"trained/{name}": float((kind & ~out).sum()), f"weight/{name}": weight}
+        found[f"held_out/{name}"] = float((kind & out).sum())
+        if len(test):
+            found[f"accuracy_held_out/{name}"] = accuracy(expit(_logits(scores, test)).mean(0), test.preference)
+    whole = sum(totals.values())
+    return found | {f"loss_share/{name}": total / whole for name, total in totals.items() if whole}
 
 
 def _member_weights(part: Terms, members: int, bootstrap: bool, rng: np.random.Generator) -> Tensor:

@@ -8,7 +8,7 @@ from prefrl.evaluate.policies import evaluation, returns
 from prefrl.improve.best import Best
 from prefrl.policies.rollout import Act, Rollout, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel
-from prefrl.sample.segments import cut, first_rollout
+from prefrl.sample.segments import cut, first_rollout, placed
 from prefrl.types import Evaluation, Segment, State, Steps
 
 NO_ZIP = (
@@ -34,7 +34,7 @@ class Player:
         if rollout is None:
             rollout = first_rollout(self._task, act, count, self._most, rng)
             self.steps = self.steps.add(query=rollout.ends.size)
-        return cut(rollout, self._task.segment_steps, count, f"round {self.rounds}", rng)
+        return placed(self._task, cut(rollout, self._task.segment_steps, count, f"round {self.rounds}", rng))
 
     @property
     def moved(self) -> bool:

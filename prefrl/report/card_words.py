@@ -68,9 +68,12 @@ def subject(about: About) -> str:
         show_count(about.ties, "tie"),
         show_count(about.candidates, "candidate"),
     ]
+    beside = f"; the fit counted {show_count(about.demonstrations, 'demonstration')} beside them"
     where = f"round {about.round}; " if about.round is not None else ""
     which = "held-out" if about.held_out else "all"
-    told = f"{where}{which} judgements of {visible(about.data, 200)}: {', '.join(parts)}"
+    told = f"{where}{which} judgements of {visible(about.data, 200)}: {', '.join(parts)}" + (
+        beside if about.demonstrations else ""
+    )
     return told[:1].upper() + told[1:]
 
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, cycle
 
 from markupsafe import Markup
 
-from prefrl.evaluate.card import Hindsight
+from prefrl.evaluate.card import Hindsight, Mistakes
 from prefrl.evaluate.summary import STAGES
 from prefrl.report import plots
 from prefrl.report.facts import Facts
 from prefrl.report.plots import Line, Series
-from prefrl.report.records import Record
+from prefrl.report.records import Record, visible, whole
+from prefrl.report.words import show_count, show_number
 from prefrl.stats.estimates import Estimate
 
 ROUNDING = 1e-9
+TASKS = ("gold", "learned", "improve", "label", "evaluate", "ink")
+"""Colours of several tasks, by turns."""
 INTERVAL = 1.96
 """Standard errors on each side of a mean."""
 TRAINING = {
@@ -58,6 +62,7 @@ def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
     none, and once it is over none that is empty."""
     found: tuple[Chapter, ...] = (
         Chapter("Did it help?", (*_learning(record, facts), *_drift(record, facts))),
+        Chapter("Does it follow the expert?", _shifting(record)),
         Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
         Chapter("How did it learn?", _training(record)),
         Chapter("What did it cost?", _cost(record, facts)),
@@ -72,7 +77,7 @@ def _known(values: Series) -> bool:
 
 
 def _learning(record: Record, facts: Facts) -> tuple[Card, ...]:
-    gold = (_gold(record),) if _known(record.series("evaluate/gold")) or not facts.finished else ()
+    gold = (_gold(record), *_golds(record)) if _known(record.series("evaluate/gold")) or not facts.finished else ()
     if record.hindsight is None:
         return (*gold, _learned_then(record, facts))
     agreement = (_agreement(record),) if gold else ()
@@ -102,6 +107,17 @@ def _gold(record: Record) -> Card:
         "The task's own value of fresh behaviour, which nothing that learns may read: up is better. "
         f"The band is the {band}.{said}",
     )
+
+
+def _golds(record: Record) -> tuple[Card, ...]:
+    """Of each of several tasks."""
+    mark = "evaluate/gold/"
+    names = sorted({key.removeprefix(mark) for line in record.rounds for key in line if key.startswith(mark)})
+    shades = zip(names, cycle(TASKS), strict=False)
+    curves = [Line(record.series(mark + name), colour, visible(name, 40)) for name, colour in shades]
+    drawn = plots.lines("golds", record.numbers, curves) if curves else Markup("")
+    reading = "The mean of the episodes of each task. What is called gold elsewhere is the mean of these."
+    return (Card("Gold of each task", drawn, reading),) if drawn else ()
 
 
 def _by_newest(found: Hindsight, facts: Facts) -> tuple[Card, ...]:
@@ -228,6 +244,99 @@ def _fitting(record: Record) -> tuple[Card, ...]:
             "training loss falls is overfitting.",
         ),
         *(() if record.card else (_calibration(record),)),  # a card has one of its own
+        *_apart(record),
+    )
+
+
+def _apart(record: Record) -> tuple[Card, ...]:
+    """What comparisons and demonstrations had each in fits on both."""
+    if not _known(record.series("fit/trained/shown")):
+        return ()
+    kinds = (("judged", "judgements", "learned", "-"), ("shown", "demonstrations", "gold", "--"))
+
+    def curves(key: str) -> list[Line]:
+        return [Line(record.series(f"fit/{key}/{kind}"), colour, name, dash) for kind, name, colour, dash in kinds]
+
+    def newest(key: str, kind: str) -> float | None:
+        return record.last(f"fit/{key}/{kind}")
+
+    told = " and ".join(
+        f"{show_count(whole(newest('trained', kind)), name[:-1])} of weight {show_number(newest('weight', kind))}"
+        for kind, name, _, _ in kinds
+    )
+    out = " and ".join(show_count(whole(newest("held_out", kind)), name[:-1]) for kind, name, _, _ in kinds)
+    return (
+        Card(
+            "Accuracy on what was judged, and on what was shown",
+            plots.lines("apart-accuracy", record.numbers, curves("accuracy_held_out"), percent=True),
+            "Of held-out judgements, and of held-out demonstrations, which say that what was shown is better than what "
+            f"the policy did: the share that the reward model names right. In the newest fit {out} were held out.",
+        ),
+        Card(
+            "Shares of the loss",
+            plots.lines("apart-loss", record.numbers, curves("loss_share"), percent=True, zero=True),
+            f"How much of the fit's loss is from each. The newest fit was trained on {told}: a share of the loss above "
+            "the share of the weight is what it could not yet explain.",
+        ),
+    )
+
+
+def _shifting(record: Record) -> tuple[Card, ...]:
+    """How errors come of errors, where an expert was at hand to measure them."""
+    shift = record.shift
+    if shift is None or not shift.rounds:
+        return ()
+    first, last = shift.rounds[0], shift.rounds[-1]
+    shown = [(first, "muted", "start"), (last, "improve", f"round {last.round}")][-len(shift.rounds) :]
+    at = [[shift.every * (i + 1) for i in range(len(one.error))] for one, _, _ in shown]
+    sums = [_added_up(one, shift.every) for one, _, _ in shown]
+    ends, eps = at[-1], last.eps
+    level = [(ends, Line([eps] * len(ends), "ink", "eps", "--"))]
+    bounds = [
+        (ends, Line([eps * h for h in ends], "ink", "eps H", "--")),
+        (ends, Line([eps * h * h / 2 for h in ends], "ink", "eps H²/2", ":")),
+    ]
+    return (
+        Card(
+            "Error at each step",
+            plots.several(
+                "shift-error",
+                [*((x, Line(one.error, c, n)) for x, (one, c, n) in zip(at, shown, strict=True)), *level],
+                "step of an episode",
+            ),
+            "How far the policy's action is from the expert's in the states that the policy comes to: 0 is the same, 1 "
+            f"the farthest there is. The mean over {shift.episodes} evaluation episodes, as long as they go on. eps, "
+            f"{show_number(eps)}, is the mean error of round {last.round} over all steps of as many episodes of the "
+            "expert's own. A policy that stays far above it has left the states that the expert comes to.",
+        ),
+        Card(
+            "Mistakes up to step H",
+            plots.several(
+                "shift-sum",
+                [
+                    *((x, Line(s, c, n)) for x, s, (_, c, n) in zip(at, sums, shown, strict=True)),
+                    *(bounds if eps else ()),
+                ],
+                "H, steps of an episode",
+                log=True,
+            ),
+            f"The same errors added up, both axes logarithmic. {_compounding(sums[-1][-1], eps, ends[-1])}",
+        ),
+    )
+
+
+def _added_up(one: Mistakes, every: int) -> list[float]:
+    return list(accumulate(every * e * r for e, r in zip(one.error, one.running, strict=True)))
+
+
+def _compounding(total: float, eps: float, steps: int) -> str:
+    if not eps:
+        return "The newest policy errs nowhere in the expert's own episodes, so there are no lines to compare with."
+    linear, square = show_number(total / (eps * steps)), show_number(2 * total / (eps * steps**2))
+    return (
+        "With an error of eps at every step they are eps H; where one mistake spoils all that comes after it they are "
+        f"about eps H²/2. After {show_count(steps, 'step')} the newest policy has {show_number(total)}, which is "
+        f"{linear} times eps H and {square} times eps H²/2."
     )
 
 
@@ -260,12 +369,15 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
     at = record.numbers
     seconds = {stage: record.series(f"seconds/{stage}") for stage in STAGES}
     labels = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
+    curves = [Line(record.series(f"label/{n}"), c, n, d) for n, c, d in labels]
+    shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
+    curves += [Line(record.series("label/demonstrations"), "improve", "shown", "-.")] if shown else []
     steps = [("learn", "improve", "-"), ("query", "sample", "--"), ("evaluate", "evaluate", ":")]
     return (
         Card(
             "Labels",
-            plots.lines("labels", at, [Line(record.series(f"label/{n}"), c, n, d) for n, c, d in labels], zero=True),
-            "Queries asked, answered and skipped so far.",
+            plots.lines("labels", at, curves, zero=True),
+            f"Queries asked, answered and skipped so far.{shown}",
         ),
         Card(
             f"{facts.words.spent}s".capitalize(),

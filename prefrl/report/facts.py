@@ -53,6 +53,7 @@ class Facts:
     shown: int | None
     """Demonstrations that the policy learned from, where nothing was fitted beside; None where it learned otherwise."""
     labels: Mapping[str, int | None]
+    """Those asked, answered and skipped, and how many of the answers are demonstrations."""
     steps: Mapping[str, int | None]
     seconds: Mapping[str, float]
     """By stage; only stages that were timed."""
@@ -80,7 +81,7 @@ def gather(record: Record) -> Facts:
     rounds = whole(summary.get("rounds")) or max((whole(line["round"]) or 0 for line in record.rounds), default=0)
 
     def total(name: str, keys: Sequence[str], stage: str) -> dict[str, int | None]:
-        of = mapping(summary.get(name))
+        of = mapping(summary.get(name)) or (record.labels if name == "labels" else {})
         return {key: whole(of[key]) if key in of else whole(last(f"{stage}/{key}")) for key in keys}
 
     def first(key: str, fallback: float | None) -> float | None:
@@ -110,7 +111,7 @@ def gather(record: Record) -> Facts:
         kl=first("kl", last("evaluate/kl")),
         drifted=_drifted(record),
         shown=None if _has_fitted(record) else whole(last("improve/demonstrations")),
-        labels=total("labels", ("asked", "answered", "skipped"), "label"),
+        labels=total("labels", ("asked", "answered", "skipped", "demonstrations"), "label"),
         steps=total("steps", ("learn", "query", "evaluate"), "steps"),
         seconds=seconds,
         total_seconds=number(mapping(summary.get("seconds")).get("total")) or sum(seconds.values()) or None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, NullFormatter, PercentFormatter
 
 from prefrl.evaluate.card import Bin
 from prefrl.evaluate.summary import STAGES
@@ -118,19 +118,36 @@ class Strip:
     """A name in `COLOURS`."""
 
 
-def several(name: str, curves: Sequence[tuple[Sequence[float], Line]], label: str) -> Markup:
-    """Curves that each have an x of their own; empty where none has a point."""
-    drawn = [(x, curve) for x, curve in curves if x]
+def several(name: str, curves: Sequence[tuple[Sequence[float], Line]], label: str, log: bool = False) -> Markup:
+    """Curves that each have an x of their own; empty where none has a point. `log`: on logarithmic axes, which leave
+    out what is not above 0."""
+    drawn = [(x, _above_zero(curve) if log else curve) for x, curve in curves if x]
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
         for x, curve in drawn:
             _curve(axes, np.array(x), curve)
         axes.set_xlabel(label)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7, min_n_ticks=1))
+        if log:
+            _log_axes(axes)
+        else:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=7, min_n_ticks=1))
         _legend(axes, sum(bool(curve.label) for _, curve in drawn))
 
     return _svg(name, draw) if drawn else Markup("")
+
+
+def _above_zero(curve: Line) -> Line:
+    return replace(curve, values=[value if value is not None and value > 0 else None for value in curve.values])
+
+
+def _log_axes(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))  # and no powers, which are pictures
+        axis.set_minor_formatter(NullFormatter())
+    axes.minorticks_off()
 
 
 def strips(name: str, found: Sequence[Strip], label: str) -> Markup:

@@ -18,7 +18,7 @@ import yaml
 from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import Bin, Hindsight, ReportCard
+from prefrl.evaluate.card import Bin, Hindsight, ReportCard, Shift
 from prefrl.stats.estimates import Part
 from prefrl.types import Json
 
@@ -70,6 +70,10 @@ class Record:
     """How good the reward model is, where that was measured."""
     hindsight: Hindsight | None
     """All rounds by the newest reward, where that was measured."""
+    shift: Shift | None
+    """How far the policy is from an expert, where that was measured."""
+    labels: Json
+    """What was asked and answered, of a folder of answers alone."""
     missing: tuple[str, ...]
     """Files that are not there yet, or cannot be read, in words."""
 
@@ -122,6 +126,8 @@ def read(folder: Path, examples: bool = True) -> Record:
         after=_examples(folder / "examples" / "after.json", missing) if examples else (),
         card=_part(ReportCard, folder / "card.json", missing),
         hindsight=_part(Hindsight, folder / "hindsight.json", missing),
+        shift=_part(Shift, folder / "shift.json", missing),
+        labels=_json(folder / "labels.json", dict, [], ""),
         missing=tuple(missing),
     )
 

@@ -13,7 +13,7 @@ from prefrl.report.records import Example
 def headline(facts: Facts) -> str:
     """What happened, in one plain sentence."""
     spent = [
-        show_count(facts.labels["answered"], "label") if facts.labels["answered"] is not None else "",
+        show_answers(facts),
         show_count(sum(v or 0 for v in facts.steps.values()), facts.words.spent) if any(facts.steps.values()) else "",
         show_time(facts.total_seconds) if facts.total_seconds else "",
     ]
@@ -23,11 +23,26 @@ def headline(facts: Facts) -> str:
     )
     before, after, _ = facts.gold
     if before is None or after is None:
-        return _without_gold(facts, took) if facts.rounds else "No round is over yet."
+        return _without_gold(facts, took) if facts.rounds else _before_any_round(facts)
     start, end = show_number(before, after), show_number(after, before)
     if start == end:
         return f"Gold stayed at {end} {took}."
     return f"Gold {'rose' if after > before else 'fell'} from {start} to {end} {took}."
+
+
+def show_answers(facts: Facts) -> str:
+    """How many labels there were, and how many of them showed what to do; empty where that is not known."""
+    answered, shown = facts.labels["answered"], facts.labels["demonstrations"]
+    if answered is None or not shown:
+        return "" if answered is None else show_count(answered, "label")
+    return show_count(shown, "demonstration") + (
+        f" and {show_count(answered - shown, 'other label')}" if answered > shown else ""
+    )
+
+
+def _before_any_round(facts: Facts) -> str:
+    answers = show_answers(facts)
+    return f"No round is over yet; there are {answers}." if facts.labels["answered"] else "No round is over yet."
 
 
 def _without_gold(facts: Facts, took: str) -> str:

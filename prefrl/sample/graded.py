@@ -14,7 +14,7 @@ import numpy as np
 from prefrl.policies.loaded import Loaded
 from prefrl.protocols import ControlTask
 from prefrl.sample.queries import across
-from prefrl.sample.segments import cut, first_rollout
+from prefrl.sample.segments import cut, first_rollout, placed
 from prefrl.types import Query, Segment
 
 SPARE = 2
@@ -39,7 +39,7 @@ def graded(
     pools = []
     for name, policy in policies.items():
         rollout = first_rollout(task, policy.act(rng), each, MOST, rng)
-        pools.append(cut(rollout, task.segment_steps, each, name, rng))
+        pools.append(placed(task, cut(rollout, task.segment_steps, each, name, rng)))
     found = across(pools, size, count, rng)
     if len(found) < count:
         raise ValueError(

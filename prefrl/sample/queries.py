@@ -77,12 +77,16 @@ def across(pools: Sequence[Sequence[C]], size: int, count: int, rng: np.random.G
         order, query = rng.permutation(len(pools)), list[C]()
         for slot in range(size):
             stock = left[order[slot % len(pools)]]
-            at = next((i for i, one in enumerate(stock) if not any(overlap(one, other) for other in query)), None)
+            at = next((i for i, one in enumerate(stock) if all(_may_join(one, other) for other in query)), None)
             if at is None:
                 return found
             query.append(stock.pop(at))
         found.append(Query(tuple(query)))
     return found
+
+
+def _may_join(one: Candidate, other: Candidate) -> bool:
+    return one.context == other.context and not overlap(one, other)
 
 
 def proposals(pool: Sequence[C], size: int, times: int, rng: np.random.Generator) -> Integers:

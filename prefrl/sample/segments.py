@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, collect, joined
-from prefrl.protocols import ControlTask
+from prefrl.protocols import ControlTask, Mixed
 from prefrl.types import Floats, Segment
 
 OVERLAP = 24
@@ -85,7 +87,14 @@ def piece(one: Segment, start: int, length: int) -> Segment:
     """Some steps of a segment, with their states and gold."""
     part = slice(start, start + length)
     states, gold = (None if x is None else x[part] for x in (one.states, one.gold))
-    return Segment(one.observations[part], one.actions[part], one.episode, one.start + start, states, gold)
+    return Segment(one.observations[part], one.actions[part], one.episode, one.start + start, states, gold, one.context)
+
+
+def placed(task: ControlTask, segments: Sequence[Segment]) -> list[Segment]:
+    """Segments that are of one of several tasks, each in the context of its own."""
+    if not isinstance(task, Mixed):
+        return list(segments)
+    return [replace(one, context=task.names[int(task.which(one.observations[0]))]) for one in segments]
 
 
 def first_rollout(task: ControlTask, act: Act, count: int, most: int, rng: np.random.Generator) -> Rollout:

@@ -22,6 +22,8 @@ from prefrl.storage.files import read_lines, write_file
 from prefrl.store import Store
 from prefrl.types import Query, Response
 
+LABELS = "labels.json"
+"""What a folder of answers alone has been asked and told, for its report."""
 Tell = Callable[[str], None]
 """How a person is told something while a stage goes on."""
 
@@ -65,7 +67,9 @@ def label(
             loop.ask(config.loop.labels - asked, streams(config.seed, 1 + asked))
         with attended(loop.labeler, store, tell):
             loop.labeler.answer(store, streams(config.seed, 1).label)
-        return store.counts()
+        counts = store.counts()
+        write_file(folder / LABELS, json.dumps(counts).encode())
+        return counts
 
 
 def serve(folder: Path, overrides: Sequence[str] = (), tell: Tell = lambda _: None) -> dict[str, int]:

@@ -532,6 +532,7 @@ def test_what_was_shown_is_better_than_what_it_answers(tmp_path: Path, make_segm
         reward = model()
         fitted = fit(reward, store, FittingSettings(epochs=40), np.random.default_rng(0))
         assert (fitted.metrics["judgements"], fitted.metrics["shown"]) == (60, 59)
+        assert not any("/" in name for name in fit(model(), store, off, np.random.default_rng(0)).metrics)
         assert (reward.score(better) > reward.score(own)).mean() > 0.9
         assert "shown" not in fit(model(), store, off, np.random.default_rng(0)).metrics
 
@@ -565,3 +566,23 @@ def test_only_the_newest_answers_count_where_that_is_said(
         assert (metrics["judgements"], metrics["shown"]) == (8, 4)
         every = fit(model(), store, FittingSettings(epochs=1), np.random.default_rng(0)).metrics
         assert (every["judgements"], every["shown"]) == (36, 6)
+
+
+def test_a_fit_on_judgements_and_demonstrations_says_what_each_kind_had(
+    judged: list[Judged[Segment]], make_segment: Callable[..., Segment]
+) -> None:
+    """The last ones are what demonstrations imply; those held out count in no weight, and a share is one of the sum."""
+    heavy = [replace(one, judgement=replace(one.judgement, weight=3.0)) for one in judged[40:60]]
+    settings, together = FittingSettings(epochs=3, held_out=0.25), [*judged[:40], *heavy]
+    rng = np.random.default_rng
+    found = fit_judged(model(), together, settings, rng(0), shown=20).metrics
+    plain = fit_judged(model(), together, settings, rng(0)).metrics
+    assert {name: value for name, value in found.items() if "/" not in name} == plain
+    trained, held_out = ([found[f"{key}/{kind}"] for kind in ("judged", "shown")] for key in ("trained", "held_out"))
+    assert [a + b for a, b in zip(trained, held_out, strict=True)] == [40, 20]
+    assert [found["weight/judged"], found["weight/shown"]] == [trained[0], 3 * trained[1]]
+    assert found["loss_share/judged"] + found["loss_share/shown"] == pytest.approx(1)
+    split_up = [
+        found[f"accuracy_held_out/{kind}"] * count for kind, count in zip(("judged", "shown"), held_out, strict=True)
+    ]
+    assert sum(split_up) / sum(held_out) == pytest.approx(found["accuracy_held_out"])

@@ -19,7 +19,10 @@ from prefrl.envs.control import GymnasiumTask
 from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
 from prefrl.improve.control import ControlLearnerSettings
+from prefrl.improve.gradient import Batch, update
+from prefrl.improve.objectives import Objective
 from prefrl.improve.offline import Offline, Recordings
+from prefrl.improve.pairs import shuffled
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.expert import Advice, Expert, ExpertSettings
 from prefrl.protocols import Store as Kept
@@ -92,6 +95,22 @@ def test_a_pass_is_a_step_down_the_negative_log_likelihood_weighted_as_was_said(
     (by_torch,) = torch.autograd.grad(loss, parameter)
     torch.testing.assert_close(own.grad, by_torch, rtol=1e-5, atol=1e-6)
     assert metrics["cloning_loss"] == pytest.approx(float(loss.detach()) + 2.0 * again.policy.peak, rel=1e-4)
+
+
+def test_a_pass_is_the_policy_gradient_with_an_advantage_of_one_to_the_bit(tmp_path: Path) -> None:
+    task = point()
+    one, again = (learner(task, cloning_epochs=1, cloning_minibatch=5) for _ in range(2))
+    store = shown(tmp_path, task, to_the_middle, episodes=2)
+    one.improve(cast(Any, Known()), store, np.random.default_rng(4))
+    segments = [one.like for one in store.demonstrations()]
+    again.policy.observe(np.concatenate([segment.observations for segment in segments]))
+    steps = Recordings.of(segments, again.policy).decisions
+    ones = torch.ones(sum(map(len, segments)), 1)
+    objective = Objective(clip=None, value=0.0, entropy=0.0, max_grad_norm=1.0)
+    rows = [torch.from_numpy(at) for at in shuffled(len(ones), 5, np.random.default_rng(4))]
+    update(again.policy, again.optimizer, Batch(steps, torch.zeros_like(ones), ones), rows, objective)
+    for own, other in zip(one.policy.parameters(), again.policy.parameters(), strict=True):
+        assert torch.equal(own, other)
 
 
 def _seen(rng: np.random.Generator, count: int, steps: int) -> Floats:

@@ -14,7 +14,8 @@ from preferred import LIKES, NO_REWARD, SMALL
 
 from prefrl.envs.text import Reviews
 from prefrl.improve.direct import Direct
-from prefrl.improve.sft import SFTSettings, best_responses
+from prefrl.improve.objectives import policy_gradient
+from prefrl.improve.sft import SFTSettings, _parts, best_responses
 from prefrl.judgements import Comparison, Demonstration, Judged, Judgement, Ranking
 from prefrl.policies.responses import Responses
 from prefrl.protocols import Store
@@ -78,6 +79,18 @@ def test_a_step_goes_down_the_mean_over_tokens_of_minus_log_pi(toy_reviews: Revi
     norm = torch.stack([p.grad.norm() for p in own.parameters() if p.grad is not None]).norm()
     assert found["grad_norm"] == pytest.approx(float(norm), rel=1e-3)
     assert found["responses"] == len(rows)
+
+
+def test_its_gradient_is_the_policy_gradient_with_an_advantage_of_one_to_the_bit(toy_reviews: Reviews) -> None:
+    one, other = learner(toy_reviews), learner(toy_reviews)
+    drawn = one.policy.respond(["The plot was"], 5, np.random.default_rng(0))
+    for loss, _ in _parts(one.policy, settings(), drawn, np.arange(5)):
+        loss.backward()  # type: ignore[no-untyped-call]
+    logp = other.policy.log_prob(drawn)[0]
+    (policy_gradient(logp, torch.ones_like(logp)).sum() / drawn.mask.sum()).backward()  # type: ignore[no-untyped-call]
+    gradients = [[p.grad for p in each.policy.parameters() if p.grad is not None] for each in (one, other)]
+    assert len(gradients[0]) == len(gradients[1]) > 3
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
 def test_it_learns_to_write_like_the_better_ones(toy_reviews: Reviews, judged: Store[Response]) -> None:

@@ -49,7 +49,7 @@ def test_whole_episodes_are_shown_once_and_stand_for_themselves(pendulum: Contro
         shown = store.demonstrations()
         assert [len(one.like) for one in shown] == [20, 20, 20]
         assert all(one.like.id == one.query.candidates[0].id for one in shown)
-        assert store.counts() == {"asked": 3, "answered": 3, "skipped": 0}
+        assert store.counts() == {"asked": 3, "answered": 3, "skipped": 0, "demonstrations": 3}
 
 
 def test_an_expert_who_goes_one_way_or_another_keeps_to_it_for_an_episode(tmp_path: Path) -> None:

@@ -234,6 +234,59 @@ def test_a_run_that_was_shown_what_to_do_says_that_nothing_was_compared(tmp_path
     assert "nothing was compared" not in fitted.text
 
 
+def test_what_judgements_and_demonstrations_had_in_a_fit_is_shown(tmp_path: Path) -> None:
+    both = {"fit/trained/judged": 54, "fit/weight/judged": 54.0, "fit/held_out/judged": 6, "fit/loss_share/judged": 0.7}
+    both |= {"fit/trained/shown": 9, "fit/weight/shown": 4.5, "fit/held_out/shown": 1, "fit/loss_share/shown": 0.3}
+    both |= {"fit/accuracy_held_out/judged": 0.8, "fit/accuracy_held_out/shown": 1.0, "label/demonstrations": 10}
+    lines = [line(0), line(1, **both), line(2, **both), line(3, **both)]
+    labels = {"asked": 70, "answered": 70, "skipped": 0, "demonstrations": 10}
+    found = page(run_folder(tmp_path / "run", lines, summary=summary(labels=labels)))
+    assert "In the newest fit 6 judgements and 1 demonstration were held out." in found.text
+    assert "trained on 54 judgements of weight 54.0 and 9 demonstrations of weight 4.50" in found.text
+    assert "(10 demonstrations and 60 other labels" in found.text
+    assert "70 asked, 0 skipped; 10 demonstrations" in found.text
+    plain = page(run_folder(tmp_path / "plain", [line(0), line(1)], summary=summary()))
+    assert "Shares of the loss" not in plain.text
+    assert "demonstration" not in plain.text
+
+
+def test_mistakes_are_added_up_beside_the_lines_of_the_measured_eps(tmp_path: Path) -> None:
+    """After 4 steps 0.1 + 0.3 + (0.3 + 0.5) / 2 = 0.8; eps H is 0.4 and eps H^2 / 2 is 0.8."""
+    rounds = [
+        {"round": 0, "eps": 0.5, "error": [0.5] * 4, "running": [1.0] * 4},
+        {"round": 3, "eps": 0.1, "error": [0.1, 0.3, 0.3, 0.5], "running": [1.0, 1.0, 0.5, 0.5]},
+    ]
+    folder = run_folder(tmp_path / "run", [line(i) for i in range(4)], summary=summary())
+    (folder / "shift.json").write_text(json.dumps({"episodes": 2, "every": 1, "rounds": rounds}))
+    found = page(folder)
+    assert "Does it follow the expert?" in found.text
+    assert (
+        "eps, 0.10, is the mean error of round 3 over all steps of as many episodes of the expert's own." in found.text
+    )
+    assert "After 4 steps the newest policy has 0.80, which is 2.00 times eps H and 1.00 times eps H²/2." in found.text
+    rounds[1]["eps"] = 0.0
+    (folder / "shift.json").write_text(json.dumps({"episodes": 2, "every": 1, "rounds": rounds[1:]}))
+    assert "errs nowhere in the expert's own episodes" in page(folder).text
+    (folder / "shift.json").write_text('{"episodes": 2}')
+    assert "shift.json: cannot be read" in page(folder).text
+
+
+def test_each_of_several_tasks_has_a_curve(tmp_path: Path) -> None:
+    lines = [line(i, **{"evaluate/gold/mars": 1.0 * i, "evaluate/gold/<blink>earth": -1.0}) for i in range(4)]
+    found = page(run_folder(tmp_path / "run", lines, summary=summary()))
+    assert "Gold of each task" in found.text
+    assert "mars" in found.text
+    assert "<blink>earth" in found.text
+    assert "blink" not in found.tags
+
+
+def test_a_folder_of_demonstrations_alone_says_how_many_there_are(tmp_path: Path) -> None:
+    (tmp_path / "labels.json").write_text(json.dumps({"asked": 4, "answered": 4, "skipped": 0, "demonstrations": 4}))
+    found = page(tmp_path)
+    assert "No round is over yet; there are 4 demonstrations." in found.text
+    assert "4 asked, 0 skipped; 4 demonstrations" in found.text
+
+
 def test_noise_is_told_from_change_by_the_intervals_of_the_means(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/count": 100.0, "evaluate/gold_std": 40.0}) for i in range(2)]
     near = page(run_folder(tmp_path / "near", lines, summary=summary(gold_after=-95.0)))
