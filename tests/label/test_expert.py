@@ -214,6 +214,30 @@ def test_a_demonstrator_answers_with_pieces_of_what_was_shown(pendulum: ControlT
         np.testing.assert_allclose(one.like.observations[0, 0], float(one.like.episode[-1]) + one.like.start / 100)
 
 
+def test_a_demonstrator_without_a_file_lets_an_expert_show_episodes_and_answers_with_their_pieces(
+    pendulum: ControlTask, tmp_path: Path
+) -> None:
+    with Store[Segment](tmp_path) as store:
+        labeler = DemonstratorSettings(expert=ExpertSettings(episodes=2)).build(pendulum)
+        labeler.answer(store, np.random.default_rng(0))
+        whole = [one.like for one in store.demonstrations()]
+        store.ask([Query((some(),))])
+        labeler.answer(store, np.random.default_rng(0))
+        (answer,) = store.demonstrations()[2:]
+    assert [len(one) for one in whole] == [20, 20]
+    (origin,) = (one for one in whole if one.episode == answer.like.episode)
+    place = slice(answer.like.start, answer.like.start + 5)
+    np.testing.assert_array_equal(answer.like.actions, origin.actions[place])
+
+
+def test_a_demonstrator_that_was_shown_nothing_says_so(pendulum: ControlTask, tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store:
+        store.ask([Query((some(),))])
+        labeler = DemonstratorSettings(expert=ExpertSettings(episodes=0)).build(pendulum)
+        with pytest.raises(ValueError, match=r"5 steps of what was shown, and there are none: set labeler\.data"):
+            labeler.answer(store, np.random.default_rng(0))
+
+
 def test_demonstrations_that_are_too_short_or_of_other_sizes_are_refused(pendulum: ControlTask, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"labeler\.data: no demonstration of .* has task\.segment_steps=5 steps"):
         DemonstratorSettings(data=recorded(tmp_path / "short", steps=4)).build(pendulum)
