@@ -197,11 +197,16 @@ class Run:
 
     def _score_probes(self, number: int) -> None:
         """The scores of the first judged candidates, the same ones in every round: how far does a refit move them?"""
-        ids = self._probes[0]["candidates"] if self._probes else first_judged(self.store.judged())
+        ids = self._probes[0]["candidates"] if self._probes else self._first_fitted()
         scores = self.loop.reward.score([self.store.candidate(id) for id in ids])
         row = {"round": number, "scores": [float(score) for score in scores]}
         self._probes.append(row if self._probes else row | {"candidates": ids})
         write_file(self.folder / "probes.jsonl", "".join(json.dumps(r) + "\n" for r in self._probes).encode())
+
+    def _first_fitted(self) -> list[str]:
+        """The first candidates that were judged; of what demonstrations imply, where nothing was judged."""
+        implied = (one.implied(1.0) for one in self.store.demonstrations())
+        return first_judged(self.store.judged() or [one for one in implied if one is not None])
 
     def _save_examples(self, round: Round) -> None:
         """A few candidates to look at, of the starting policy and of the newest one."""
