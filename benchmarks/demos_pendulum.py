@@ -1,36 +1,50 @@
 """Cloning an expert who swings a pendulum up: prefrl against imitation on the same demonstrations.
 
-    python benchmarks/demos_pendulum.py --method clone|noise|dagger [--seeds 5] [--first 100] [--short]
-        [--peers .venv-peers-control/bin/python]
+    python benchmarks/demos_pendulum.py --method clone|noise|dagger|adversarial [--seeds 5] [--first 100] [--short]
+        [--peers .venv-peers-control/bin/python] [--alone]
 
 `clone`: four episodes of the expert, 800 answered steps; `noise`: the same with noise in what is executed (DART);
 `dagger`: one episode, and 600 steps of the learner's own that the expert answers. imitation's BC is given the same
 episodes, its DAgger the same expert and as many answered steps, each with as many passes over the data, minibatches as
 large and the same network. 20 episodes of the policy's mode are scored. The last line is one JSON object: `gold` and
 `peer_gold` are means over seeds, `ratio` is peer / ours in CPU seconds of cloning (medians).
+
+`adversarial`: control/pendulum-adversarial, which has four clean episodes, against imitation's GAIL on the same
+episodes for as many steps from a random start, as is usual there. `early` is the return after at most 30,000 steps of
+the policy's own and `gold` the one at the end, after about 120,000; our CPU seconds hold all evaluations.
+`--alone` leaves the peer out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from prefrl.types import Segment
+
 EPISODES, EPOCHS, MINIBATCH, RATE = 20, 200, 64, 1e-3
+EARLY, LATE = 30_000, 120_000
+"""Steps of an adversary's own, when it is scored."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 SETTINGS = {
     "clone": ["control/pendulum-demos", "labeler.noise=0"],
     "noise": ["control/pendulum-demos"],
     "dagger": ["control/pendulum-dagger"],
+    "adversarial": ["control/pendulum-adversarial"],
 }
 
 
@@ -40,34 +54,43 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--short", action="store_true", help="one seed")
+    parser.add_argument("--alone", action="store_true", help="without the peer")
     parser.add_argument("--peers", default=".venv-peers-control/bin/python", help="Python that has imitation")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
-        print("RESULT " + json.dumps(peer(options.method, options.worker, options.first)), flush=True)
+        work = gail if options.method == "adversarial" else partial(peer, options.method)
+        print("RESULT " + json.dumps(work(options.worker, options.first)), flush=True)
         return
-    if not Path(options.peers).exists():
+    if not (options.alone or Path(options.peers).exists()):
         sys.exit(f"no {options.peers}: run `make peers`, or install benchmarks/peers-control.txt and say --peers")
     found: dict[str, list[dict[str, float]]] = {"ours": [], "peer": []}
     for seed in range(options.first, options.first + (1 if options.short else options.seeds)):
         with tempfile.TemporaryDirectory() as folder:
-            found["ours"].append(ours(options.method, Path(folder), seed))
-            found["peer"].append(other(options, Path(folder), seed))
-        print(f"seed {seed}: ours {found['ours'][-1]}, peer {found['peer'][-1]}", flush=True)
+            mine = adversary(Path(folder), seed) if options.method == "adversarial" else None
+            found["ours"].append(mine or ours(options.method, Path(folder), seed))
+            print(f"seed {seed}: ours {found['ours'][-1]}", flush=True)
+            if not options.alone:
+                found["peer"].append(other(options, Path(folder), seed))
+                print(f"seed {seed}: peer {found['peer'][-1]}", flush=True)
     print(json.dumps(said(options.method, found) | {"short": options.short}))
 
 
 def said(method: str, found: dict[str, list[dict[str, float]]]) -> dict[str, Any]:
-    gold = {name: [run["gold"] for run in runs] for name, runs in found.items()}
-    cpu = {name: statistics.median(run["cpu"] for run in runs) for name, runs in found.items()}
+    ran = {name: runs for name, runs in found.items() if runs}
+    cpu = {name: statistics.median(run["cpu"] for run in runs) for name, runs in ran.items()}
+    early = {name: [run["early"] for run in runs] for name, runs in ran.items() if "early" in runs[0]}
+    gold = {name: [run["gold"] for run in runs] for name, runs in ran.items()}
+    means = {name: round(statistics.mean(values), 1) for name, values in gold.items()}
     return {
         "name": f"demos_pendulum: {method}",
         "unit": "return",
-        "gold": round(statistics.mean(gold["ours"]), 1),
-        "peer_gold": round(statistics.mean(gold["peer"]), 1),
+        "gold": means["ours"],
+        "peer_gold": means.get("peer"),
         "golds": gold,
+        **({"early": early} if early else {}),
         "cpu": cpu,
-        "ratio": round(cpu["peer"] / cpu["ours"], 2),
+        "ratio": round(cpu["peer"] / cpu["ours"], 2) if "peer" in cpu else None,
         "equal_work": True,
     }
 
@@ -103,8 +126,38 @@ def ours(method: str, folder: Path, seed: int) -> dict[str, float]:
         loop.learner.improve = timed  # type: ignore[method-assign]
         *_, last = loop.run()
         shown = [one.like for one in store.demonstrations() if one.like.id == one.query.candidates[0].id]
-    np.savez(folder / "shown.npz", seen=[s.observations for s in shown], done=[s.actions for s in shown])
+    keep(folder, shown)
     return {"gold": round(last.metrics["evaluate/gold"], 1), "cpu": round(cpu, 2)}
+
+
+def keep(folder: Path, shown: Sequence[Segment]) -> None:
+    np.savez(folder / "shown.npz", seen=[s.observations for s in shown], done=[s.actions for s in shown])
+
+
+def adversary(folder: Path, seed: int) -> dict[str, float]:
+    """A run of the preset; what its expert showed is left in `folder` for the peer."""
+    import torch
+
+    from prefrl.config import Config
+    from prefrl.store import Store
+    from prefrl.types import Segment
+
+    torch.set_num_threads(1)
+    config = Config.load("control/pendulum-adversarial", [f"seed={seed}", f"learner.evaluation_episodes={EPISODES}"])
+    early, begin = math.nan, time.process_time()
+    with Store[Segment](folder / "store") as store:
+        for done in config.build(store).run():
+            own = done.metrics["steps/learn"] + done.metrics["steps/query"]
+            early = done.metrics["evaluate/gold"] if own <= EARLY else early
+        cpu = time.process_time() - begin
+        shown = [one.like for one in store.demonstrations() if one.like.id == one.query.candidates[0].id]
+    keep(folder, shown)
+    return {
+        "early": round(early, 1),
+        "gold": round(done.metrics["evaluate/gold"], 1),
+        "steps": own,
+        "cpu": round(cpu, 1),
+    }
 
 
 def other(options: argparse.Namespace, folder: Path, seed: int) -> dict[str, float]:
@@ -175,6 +228,56 @@ def peer(method: str, folder: Path, seed: int) -> dict[str, float]:
     fresh = make_vec_env("Pendulum-v1", rng=np.random.default_rng(seed + 10_000), n_envs=1)
     gold, _ = evaluate_policy(trainer.policy, fresh, EPISODES, deterministic=True)
     return {"gold": round(float(np.mean(gold)), 1), "cpu": round(cpu, 2)}
+
+
+def gail(folder: Path, seed: int) -> dict[str, float]:
+    """imitation's GAIL on the same episodes, with PPO of stable-baselines3 and the settings of its documentation's
+    example, but for environments and rollouts as ours."""
+    import torch
+    from imitation.algorithms.adversarial.gail import GAIL
+    from imitation.data.types import Trajectory
+    from imitation.rewards.reward_nets import BasicRewardNet
+    from imitation.util.networks import RunningNorm
+    from imitation.util.util import make_vec_env
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    venv = make_vec_env("Pendulum-v1", rng=np.random.default_rng(seed), n_envs=8)
+    found = np.load(folder / "shown.npz")
+    episodes = [
+        Trajectory(np.concatenate([seen, seen[-1:]]), done, None, terminal=True)
+        for seen, done in zip(found["seen"], found["done"], strict=True)
+    ]
+    learner = PPO(
+        "MlpPolicy",
+        venv,
+        n_steps=240,
+        batch_size=64,
+        ent_coef=0.0,
+        learning_rate=4e-4,
+        gamma=0.95,
+        n_epochs=5,
+        seed=seed,
+    )
+    trainer = GAIL(
+        demonstrations=episodes,
+        demo_batch_size=512,
+        gen_replay_buffer_capacity=2048,
+        n_disc_updates_per_round=8,
+        venv=venv,
+        gen_algo=learner,
+        reward_net=BasicRewardNet(venv.observation_space, venv.action_space, normalize_input_layer=RunningNorm),
+    )
+    said, cpu = {}, 0.0
+    for name, steps in (("early", EARLY), ("gold", LATE - EARLY)):
+        begin = time.process_time()
+        trainer.train(steps)
+        cpu += time.process_time() - begin
+        fresh = make_vec_env("Pendulum-v1", rng=np.random.default_rng(seed + 10_000), n_envs=1)
+        said[name] = round(float(np.mean(evaluate_policy(learner, fresh, EPISODES, deterministic=True)[0])), 1)
+    return {**said, "cpu": round(cpu, 1)}
 
 
 def _dagger(venv: Any, folder: Path, trainer: Any, expert: Any, episodes: Any, rng: np.random.Generator) -> None:

@@ -24,6 +24,7 @@ from prefrl.protocols import (
     LabelerSettings,
     Learner,
     LearnerSettings,
+    NeedsShowing,
     Particular,
     RewardModel,
     RewardSettings,
@@ -151,6 +152,8 @@ class Config(Settings):
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         labeler = self.build_labeler(task)
         self._check_labeler(labeler, learner)
+        if isinstance(learner, NeedsShowing):
+            learner.check_shown(isinstance(labeler, Demonstrates) or bool(store.demonstrations()))
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)

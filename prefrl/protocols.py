@@ -621,6 +621,14 @@ class Imitates(Protocol):
 
 
 @runtime_checkable
+class NeedsShowing(Protocol):
+    """A learner that may need demonstrations beside a reward."""
+
+    def check_shown(self, shows: bool) -> None:
+        """Raises `ConfigError`, before anybody is asked, where it needs them and nobody `shows` any."""
+
+
+@runtime_checkable
 class Particular(Protocol):
     """A learner that not every reward model will do for."""
 

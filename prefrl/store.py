@@ -99,12 +99,11 @@ class Store(Generic[C]):
             if answer.query not in sizes:
                 raise StoreError(f"an answer to query {answer.query[:12]}, which was never asked")
             _check_size(answer, sizes[answer.query])
-            if isinstance(answer, Demonstration):
-                self._check_shown(tx, answer)
             body = answer_body(answer) | ({"about": about} if about else {})
             revision = there.get((answer.query, answer.labeler), {"revision": 0})["revision"]
             id = f"{answer.query}:{answer.labeler}:{revision}"
             rows.append(row(id, answer_kind(answer), answer.query, answer.labeler, body))
+        self._check_shown(tx, [answer for answer in answers if isinstance(answer, Demonstration)])
         return tx.extend(rows)
 
     def put(self, tx: Transaction, answer: Answer, about: Json) -> int:
@@ -149,15 +148,17 @@ class Store(Generic[C]):
                 tx.extend(some)
         return merged
 
-    def _check_shown(self, tx: Transaction, answer: Demonstration) -> None:
-        """Raise `StoreError` unless what is shown is here, and of its query's context."""
-        (own,) = bodies(tx.connection, [answer.query])[answer.query]["candidates"]
-        found = bodies(tx.connection, [own, answer.like])
-        if answer.like not in found:
-            raise StoreError(f"a demonstration of candidate {answer.like[:12]}, which the store does not hold")
-        contexts = {load_candidate(id, body, self.folder / "blobs").context for id, body in found.items()}
-        if len(contexts) > 1:
-            raise StoreError(f"query {answer.query[:12]} is answered by a behaviour of another context (prompt)")
+    def _check_shown(self, tx: Transaction, answers: Sequence[Demonstration]) -> None:
+        """Raise `StoreError` unless what each shows is here, and of its query's context."""
+        asked = bodies(tx.connection, (one.query for one in answers))
+        own = {one.query: asked[one.query]["candidates"][0] for one in answers}
+        found = bodies(tx.connection, (*own.values(), *(one.like for one in answers)))
+        contexts = {id: load_candidate(id, body, self.folder / "blobs").context for id, body in found.items()}
+        for one in answers:
+            if one.like not in found:
+                raise StoreError(f"a demonstration of candidate {one.like[:12]}, which the store does not hold")
+            if contexts[one.like] != contexts[own[one.query]]:
+                raise StoreError(f"query {one.query[:12]} is answered by a behaviour of another context (prompt)")
 
     def _copy(self, blobs: Path, one: Json) -> None:
         self._file_one(load_candidate(one["id"], one["body"], blobs))

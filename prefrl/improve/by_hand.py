@@ -48,6 +48,20 @@ def losses(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], objecti
     return seen | distances
 
 
+def added(policy: ByHand[Any], columns: Mapping[str, npt.NDArray[Any]], weight: float, loss: float) -> Metrics:
+    """Add to the parameters' gradient that of `weight` times the loss of what is shown: its mean -log pi, each step as
+    its advantage says. Measured are that loss, as shown_loss, and the sum of both."""
+    parameters = list(policy.parameters())
+    before = [None if p.grad is None else p.grad.clone() for p in parameters]
+    shown = losses(policy, columns, Objective())["loss"]
+    for parameter, gradient in zip(parameters, before, strict=True):
+        assert parameter.grad is not None
+        parameter.grad.mul_(weight)
+        if gradient is not None:
+            parameter.grad.add_(gradient)
+    return {"loss": loss + weight * shown, "shown_loss": shown}
+
+
 def _gain_and_slope(
     logp: Floats, ratios: Floats, ratio: Floats, advantages: Floats, clip: float | None
 ) -> tuple[Floats, Floats]:

@@ -7,14 +7,13 @@ clipped. What actor and critic share is for the kind of policy to say (`learner.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -23,21 +22,23 @@ from torch import Tensor
 
 from prefrl.components import ConfigError, Settings, filled_in
 from prefrl.distributed import each_tensor, world
-from prefrl.improve.gradient import Batch, adam, steer, update
-from prefrl.improve.objectives import Objective, gae, masked_whiten
+from prefrl.improve.gradient import Batch, Beside, adam, steer, update
+from prefrl.improve.objectives import Objective
 from prefrl.improve.player import NO_ZIP, Player
-from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, Reading, forgotten, in_chunks
+from prefrl.improve.shown import Imitation, ImitationSettings
+from prefrl.improve.valued import Turn, valued
+from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, forgotten
 from prefrl.policies.cnn import CNNPolicySettings
 from prefrl.policies.divided import environments, of_all
 from prefrl.policies.flow import FlowPolicy, FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
-from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, step_rewards
+from prefrl.policies.rollout import collect, joined, learned_rewards, step_rewards
 from prefrl.policies.transformer import TransformerPolicySettings
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, to_host
-from prefrl.types import Bools, Evaluation, Floats, Metrics, Segment, State, Steps
+from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "ppo": {},
@@ -53,10 +54,6 @@ MOVED = ("hidden", "initial_std")
 """Settings that were the learner's own once, and are its policy's."""
 SLOWER = 0.3
 """What is left of the learning rate when a round was undone."""
-
-
-Read: TypeAlias = Callable[[Bools], Reading[Any]]
-"""A rollout as the policy reads it now; (n, T) of which steps it is to value what they led to."""
 
 
 def _of_some_kind(given: Any) -> Any:
@@ -119,6 +116,8 @@ class ControlLearnerSettings(Settings):
     """A run of control, or a zip of stable-baselines3, whose policy this one starts from, with its critic, its noise
     and its normaliser, which stays what it was; from the working directory where it is relative. It needs the same
     widths and spaces."""
+    clone: ImitationSettings = ImitationSettings()
+    """What is taken from demonstrations: a clone to start as, and cloning beside the objective (DAPG)."""
     evaluation_episodes: int = Field(20, ge=1)
     """Episodes of an evaluation, with the policy's mode, in environments of their own."""
     device: Device = "auto"
@@ -178,6 +177,12 @@ class ControlLearnerSettings(Settings):
             )
         return self
 
+    @model_validator(mode="after")
+    def _cloneable(self) -> ControlLearnerSettings:
+        if self.clone.on and (not isinstance(self.policy, MLPPolicySettings) or self.policy.sde):
+            raise ValueError("clone needs a policy of kind mlp without sde: leave learner.policy as it is")
+        return self
+
     def rollout_lengths(self) -> list[int]:
         """Steps in each environment of a round's rollouts."""
         each = self.steps_per_round // self.environments
@@ -187,7 +192,8 @@ class ControlLearnerSettings(Settings):
 
     def shrunk(self) -> ControlLearnerSettings:
         steps = min(self.steps_per_round, self.environments * self.rollout_steps)
-        return self.model_copy(update={"steps_per_round": steps, "evaluation_episodes": 1})
+        small = {"steps_per_round": steps, "evaluation_episodes": 1, "clone": self.clone.shrunk()}
+        return self.model_copy(update=small)
 
     def with_evaluation_of(self, other: ControlLearnerSettings) -> ControlLearnerSettings:
         return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
@@ -220,7 +226,7 @@ class ControlLearnerSettings(Settings):
             "R = A + V before whitening; a time limit bootstraps from V(final observation), a termination does not",
             f"{self.epochs} epochs over each rollout; {self.critic_epochs} more for V alone after each reward fit",
         ]
-        return "\n".join(lines)
+        return "\n".join([*lines, *([self.clone.formula()] if self.clone.on else [])])
 
 
 class ControlLearner:
@@ -238,6 +244,7 @@ class ControlLearner:
         self.policy.to(device_of(settings.device))
         self._optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self._span = 0.0, 0.0
+        self._imitation = Imitation(settings.clone, task, rng) if settings.clone.on else None
         # Read when it is first needed: a run that goes on has a policy of its own, and what it began with may be gone.
         self._start = settings.start
 
@@ -253,10 +260,11 @@ class ControlLearner:
         """`steps_per_round` environment steps of learning, from fresh episodes; metrics are means over rollouts.
 
         Those of `gradient.step`, each a mean over a rollout's gradient steps; explained, the share of the returns'
-        variance that the critic explains; and reward, the learned one of a step. Ranks share the environments, and
-        learn from what came of all of them.
+        variance that the critic explains; reward, the learned one of a step; and of a clone made now cloning_loss and
+        demonstrations. Ranks share the environments, and learn from what came of all of them.
         """
         scorer, count = step_rewards(reward), self._settings.environments
+        cloned, beside = self._imitate(store)
         envs, rollouts, metrics = environments(self._task, count), [], []
         observations, memory, begins = envs.reset(rng), None, None
         lengths = self._settings.rollout_lengths()
@@ -269,14 +277,15 @@ class ControlLearner:
                 rollout.truncated[:, -1] |= ~rollout.terminated[:, -1]
             read = partial(self.policy.read, rollout, memory)
             # Only before the first rollout is the reward one that the critic has not seen.
-            learn = partial(self._learn, rollout, read, scorer, rng, self._left(number / len(lengths)), number == 0)
-            metrics.append(self._once(learn, rng))
+            left, new = self._left(number / len(lengths)), number == 0
+            turn = Turn(rollout, read, left, new, bool(cloned), beside)
+            metrics.append(self._once(partial(self._learn, turn, scorer, rng), rng))
             rollouts.append(rollout)
             begins = rollout.ends[:, -1]
             memory = forgotten(of_all(envs, act.memory), begins)
         # One rollout in time, so that an episode that spans two of them can be cut into segments all along.
         self._player.learned_from(joined(rollouts))
-        return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]}
+        return {name: float(np.mean([m[name] for m in metrics])) for name in metrics[0]} | cloned
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in fresh environments."""
@@ -326,12 +335,19 @@ class ControlLearner:
 
     def state(self) -> State:
         self._begin()
-        return self._weights() | self._player.state()
+        cloned = {} if self._imitation is None else {"cloned": self._imitation.cloned}
+        return self._weights() | self._player.state() | cloned
 
     def load(self, state: State) -> None:
         self._start = None
+        if self._imitation is not None:
+            self._imitation.cloned = state.get("cloned", True)  # a run of before there were clones has a policy
         self._take(state)
         self._player.load(state)
+
+    def check_shown(self, shows: bool) -> None:
+        if self._imitation is not None:
+            self._imitation.check(shows)
 
     def check_ranks(self, count: int) -> None:
         if self._settings.environments < count:
@@ -372,6 +388,17 @@ class ControlLearner:
             # Few demonstrations show a part of the world: what lies elsewhere would change every scale at once.
             self.policy.freeze()
             self._start = None
+        if self._imitation is not None:
+            self._imitation.begin(cast(MLPPolicy, self.policy))
+
+    def _imitate(self, store: Store[Segment]) -> tuple[Metrics, Callable[[np.random.Generator], Beside[Any] | None]]:
+        """Become a clone where that is wanted, and say what is learned beside the objective in this round."""
+        self._begin()
+        if self._imitation is None:
+            return {}, lambda _: None
+        policy, shown = cast(MLPPolicy, self.policy), self._imitation.shown(store)
+        cloned = self._imitation.first(policy, shown)
+        return cloned, partial(self._imitation.beside, policy, shown, self._player.rounds)
 
     def _left(self, done: float) -> float:
         """What is left of the learning rate when that share of the round is done."""
@@ -387,81 +414,46 @@ class ControlLearner:
         yield
         group["lr"] = steered
 
-    def _learn(
-        self, rollout: Rollout, read: Read, reward: StepRewardModel, rng: np.random.Generator, left: float, new: bool
-    ) -> Metrics:
-        """Learn from one rollout, with what is `left` of the learning rate; the critic first, of a `new` reward."""
-        settings, objective = self._settings, self._settings.objective()
-        rewards = learned_rewards(reward, rollout)
-        batch, explained = self._batch(rollout, read, rewards)
-        if new and settings.critic_epochs:
-            alone = replace(objective, policy=False)
-            self._update(batch, settings.critic_epochs, alone, left, rng)
-            batch, explained = self._batch(rollout, read, rewards)  # advantages by the critic that knows the new reward
-        steps = self._update(batch, settings.epochs, objective, left, rng)
+    def _learn(self, turn: Turn, reward: StepRewardModel, rng: np.random.Generator) -> Metrics:
+        """Learn from one rollout."""
+        settings, left = self._settings, turn.left
+        objective = replace(settings.objective(), policy=not turn.settled)
+        rewards = learned_rewards(reward, turn.rollout)
+        value = partial(valued, self.policy, turn.rollout, turn.read, rewards, settings.discount, settings.trace)
+        batch, explained = value()
+        if turn.new and settings.critic_epochs:
+            self._update(batch, settings.critic_epochs, replace(objective, policy=False), left, rng)
+            batch, explained = value()  # advantages by the critic that knows the new reward
+        beside = turn.beside(rng) if objective.policy else None
+        steps = self._update(batch, settings.epochs, objective, left, rng, beside)
         # Not before the update: actions were drawn under the old statistics, and the ratio must start at 1.
-        self.policy.observe(rollout.observations)
-        if settings.target_kl is not None:
+        self.policy.observe(turn.rollout.observations)
+        if settings.target_kl is not None and objective.policy:
             last = steps[-len(steps) // settings.epochs :]  # the last epoch's
             kl = float(np.mean([step["kl_old"] for step in last]))
             # A KL goes with the square of the steps: a rate that is to fall is not steered up for it.
             steer(self._optimizer, kl / left**2, settings.target_kl, settings.learning_rate)
         means = {name: float(np.mean([step[name] for step in steps])) for name in steps[0]}
-        # The first step's, where nothing has changed yet: anything but rounding is a bug.
         if not self.policy.exact:
             del means["kl_old"]  # of ratios that are no probabilities' it would be none
         means["learning_rate"] = left * self._optimizer.param_groups[0]["lr"]
-        return means | {"ratio_error": steps[0]["ratio_error"], "explained": explained, "reward": float(rewards.mean())}
+        if objective.policy:
+            # The first step's, where nothing has changed yet: anything but rounding is a bug.
+            means["ratio_error"] = steps[0]["ratio_error"]
+        return means | {"explained": explained, "reward": float(rewards.mean())}
 
     def _update(
-        self, batch: Batch[Any], epochs: int, objective: Objective, left: float, rng: np.random.Generator
+        self,
+        batch: Batch[Any],
+        epochs: int,
+        objective: Objective,
+        left: float,
+        rng: np.random.Generator,
+        beside: Beside[Any] | None = None,
     ) -> list[Metrics]:
         minibatches = self._minibatches(batch, epochs, rng)
         with self._slowed(left):
-            return update(self.policy, self._optimizer, batch, minibatches, objective)
-
-    @torch.no_grad()
-    def _batch(self, rollout: Rollout, read: Read, rewards: Floats) -> tuple[Batch[Any], float]:
-        """What the update needs, in chunks of the policy's length, and how much of the returns the critic explains."""
-        settings, policy = self._settings, self.policy
-        unseen = rollout.ends.copy()
-        unseen[:, -1] = True  # what follows a row's last step is in the next rollout
-        reading = read(unseen)
-        values = reading.values  # (n, T)
-        following = self._next_values(rollout, values, reading.final, unseen)
-        ends = self._tensor(rollout.ends)
-        scaled = self._tensor(rewards).float() * _scale(settings.discount)
-        advantages = gae(scaled, values, following, ends, settings.discount, self._trace(reading.decides))
-        returns = advantages + values
-        if reading.decides is not None:  # (n, T) -> (B, 1): each decision is a sequence of its own
-            at = self._tensor(reading.decides)
-            advantages, returns = advantages[at][:, None], returns[at][:, None]
-        # The clamp: returns that do not vary leave nothing to explain.
-        explained = 1.0 - float(advantages.var() / returns.var().clamp(min=1e-12))
-        # Whitened only now: the critic's targets above are in the units of the reward.
-        white = masked_whiten(advantages, torch.ones_like(advantages))
-        # From the network that is trained, not NumPy's actor, whose last bits differ: the ratio starts at exactly 1.
-        logp, _ = policy.log_prob(reading.inputs)
-        return Batch(reading.inputs, logp, in_chunks(white, policy.chunk), in_chunks(returns, policy.chunk)), explained
-
-    def _trace(self, decides: Bools | None) -> float | Tensor:
-        """GAE's lambda, (n, T) where some steps only carry out what was decided before.
-
-        Into such steps it is 1, and what they are worth cancels: between two decisions only rewards are summed.
-        """
-        trace = self._settings.trace
-        if decides is None:
-            return trace
-        following = np.concatenate([decides[:, 1:], decides[:, :1]], 1)  # a row's last step leads out of it
-        return self._tensor(np.where(following, trace, 1.0).astype(np.float32))
-
-    def _next_values(self, rollout: Rollout, values: Tensor, final: Tensor, unseen: Bools) -> Tensor:
-        """(n, T): the value of what each step led to; `final` (k,) are those that were `unseen` (n, T)."""
-        # After an end the next column belongs to another episode, so the final observation is valued by itself. The
-        # column that fills up the end of each row is among those replaced.
-        following = torch.cat([values[:, 1:], values[:, :1]], 1)
-        following[self._tensor(unseen)] = final
-        return following * ~self._tensor(rollout.terminated)  # a time limit still has a future
+            return update(self.policy, self._optimizer, batch, minibatches, objective, beside=beside)
 
     def _minibatches(self, batch: Batch[Any], epochs: int, rng: np.random.Generator) -> list[Tensor]:
         """Rows of the batch, in each minibatch those of about as many steps as the settings say."""
@@ -487,8 +479,3 @@ class ControlLearner:
 def _flows(policy: Any) -> bool:
     """Whether that much of the settings of a policy says that it is a flow."""
     return policy.get("kind") == "flow" if isinstance(policy, dict) else isinstance(policy, FlowPolicySettings)
-
-
-def _scale(discount: float) -> float:
-    """Returns of white noise of std 1 have a std of 1 / sqrt(1 - discount^2): this undoes it."""
-    return math.sqrt(1.0 - discount**2) or 1.0  # undiscounted returns have no such limit: left as they are

@@ -83,6 +83,23 @@ class Batch(Generic[I]):
                 yield self.rows(at)
 
 
+@dataclass(frozen=True, eq=False)
+class Beside(Generic[I]):
+    """Behaviour whose log-probability is raised beside the objective, in each gradient step a part of it."""
+
+    policy: Policy[I]
+    """The one that learns, or a view of its weights."""
+    batch: Batch[I]
+    """Its advantages are how much each step counts."""
+    weight: float
+    """Of the mean log-probability."""
+    minibatches: Iterator[Tensor]
+    """Rows for as many gradient steps as there will be."""
+
+    def part(self) -> Batch[I]:
+        return self.batch.rows(next(self.minibatches))
+
+
 class Optimizer(Protocol):
     """What takes gradient steps: `Adam`, or one of torch.optim's."""
 
@@ -106,15 +123,17 @@ def update(
     minibatches: Iterable[Tensor],
     objective: Objective,
     part: int | None = None,
+    beside: Beside[I] | None = None,
 ) -> list[Metrics]:
     """A gradient step on each minibatch, given as rows of the batch; what each step measured.
 
     `part`: at most so many sequences go through the network at once; that changes memory, and results by rounding only.
+    `beside` adds its own loss to each step's, and is measured as shown_loss, before its weight.
     Raises FloatingPointError where a loss or a gradient is not finite.
     """
     if isinstance(policy, ByHand) and policy.works_by_hand and objective.value_clip is None:
-        return _update_by_hand(policy, optimizer, batch, minibatches, objective)
-    return [step(policy, optimizer, batch.rows(rows), objective, part) for rows in minibatches]
+        return _update_by_hand(policy, optimizer, batch, minibatches, objective, beside)
+    return [step(policy, optimizer, batch.rows(rows), objective, part, beside) for rows in minibatches]
 
 
 def _update_by_hand(
@@ -123,16 +142,27 @@ def _update_by_hand(
     batch: Batch[I],
     minibatches: Iterable[Tensor],
     objective: Objective,
+    beside: Beside[I] | None,
 ) -> list[Metrics]:
     parameters, longest = list(policy.parameters()), objective.max_grad_norm
     columns, found = batch.columns(), []
     for rows in map(to_numpy, minibatches):
         measured = by_hand.losses(policy, {k: x.take(rows, 0) for k, x in columns.items()}, objective)
+        if beside is not None:
+            assert isinstance(beside.policy, ByHand)
+            measured |= by_hand.added(beside.policy, beside.part().columns(), beside.weight, measured["loss"])
         found.append(_moved(parameters, optimizer, measured, longest))
     return found
 
 
-def step(policy: Policy[I], optimizer: Optimizer, batch: Batch[I], objective: Objective, part: int | None) -> Metrics:
+def step(
+    policy: Policy[I],
+    optimizer: Optimizer,
+    batch: Batch[I],
+    objective: Objective,
+    part: int | None,
+    beside: Beside[I] | None = None,
+) -> Metrics:
     """One gradient step, by automatic differentiation.
 
     Metrics, means over steps unless said: loss, grad_norm (before it is shortened), policy_loss (averaged as the
@@ -142,8 +172,20 @@ def step(policy: Policy[I], optimizer: Optimizer, batch: Batch[I], objective: Ob
     mask = batch.inputs.mask
     # Counts of the whole minibatch: a mean of the parts' means would give short parts too much weight.
     rows, steps = len(mask), int(mask.sum())
-    parts = (_losses(policy, some, objective, rows, steps) for some in batch.parts(part))
+    parts: Parts = (_losses(policy, some, objective, rows, steps) for some in batch.parts(part))
+    if beside is not None:
+        parts = _with(beside, parts)
     return descend(policy.parameters(), optimizer, parts, objective.max_grad_norm)
+
+
+def _with(beside: Beside[I], parts: Parts) -> Iterator[tuple[Tensor, dict[str, Tensor]]]:
+    """The same parts, the first of which has the loss of what is learned beside as well."""
+    shown = beside.part()
+    count = len(shown)
+    apart, _ = _losses(beside.policy, shown, Objective(), count, int(shown.inputs.mask.sum()))
+    for number, (loss, seen) in enumerate(parts):
+        mine = apart if number == 0 else loss.new_zeros(())
+        yield loss + beside.weight * mine, seen | {"shown_loss": mine.detach()}
 
 
 def descend(

@@ -22,11 +22,10 @@ from prefrl.components import ConfigError, Settings
 from prefrl.exchange.recordings import recording
 from prefrl.fit.pairs import Batch, batch
 from prefrl.fit.split import split
-from prefrl.improve import gradient
-from prefrl.improve.gradient import adam, descend_by_logp, update
-from prefrl.improve.objectives import Objective
+from prefrl.improve.gradient import adam, descend_by_logp
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import NO_ZIP, Player
+from prefrl.improve.shown import Passes, Shown, check_shown, clone, recorded, steps_of
 from prefrl.kinds import kind_of
 from prefrl.policies.acting import Acting, Actor, Clonable, Decisions, Memory
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
@@ -36,8 +35,6 @@ from prefrl.sample.segments import piece
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Integers, Metrics, Segment, State, Steps
 
-ROUNDING = 1e-4
-"""By how much an action may lie outside of its bounds: files hold them in few digits."""
 AT_ONCE = 8
 """Environments that are stepped side by side, where there are any."""
 
@@ -232,28 +229,20 @@ class Offline(Generic[P]):
         self._player.load(state)
 
     def _clone(self, segments: Sequence[Segment], weights: dict[str, float], rng: np.random.Generator) -> Metrics:
-        """Raise the log-probability of every step, which is the policy gradient with an advantage of 1, or of the
-        weight of its demonstration."""
+        """Fit the policy on all that there is; without `imitates` in the first round alone."""
         if self.policy.normaliser.count and not self._settings.imitates:
             return {}
         if new := segments[self._seen :]:
             for one in new if self._settings.imitates else ():
-                _check_shown(one, self._task)
+                check_shown(one, self._task)
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
-        settings, examples = self._settings, self.policy.examples(segments)
-        each = np.repeat([weights.get(one.id, 1.0) for one in segments], [len(one) for one in segments])
-        advantages = torch.from_numpy(each.astype(np.float32)[:, None]).to(self.policy.device)
-        objective = Objective(clip=None, value=0.0, entropy=0.0, max_grad_norm=settings.max_grad_norm)
-        found: list[Metrics] = []
-        for _ in range(settings.cloning_epochs):
-            parts = shuffled(len(each), settings.cloning_minibatch, rng)
-            rows = (torch.from_numpy(at).to(self.policy.device) for at in parts)
-            steps = gradient.Batch(self.policy.redrawn(examples, rng), torch.zeros_like(advantages), advantages)
-            found = update(self.policy, self.optimizer, steps, rows, objective)
-        # Of a std that stays, a density says nothing: against the mode's it is a distance.
-        beside = self.policy.ceiling * float(each.mean())
-        return {"cloning_loss": float(np.mean([one["loss"] for one in found])) + beside} if found else {}
+        settings = self._settings
+        if not settings.cloning_epochs:
+            return {}
+        passes = Passes(settings.cloning_epochs, settings.cloning_minibatch, settings.max_grad_norm)
+        steps = steps_of(Shown(segments, weights), self.policy)
+        return {"cloning_loss": clone(self.policy, self.optimizer, steps, passes, rng)}
 
     def descend(
         self, steps: Decisions, rows: Integers, loss_of: Callable[[Tensor], tuple[Tensor, dict[str, Tensor]]]
@@ -291,22 +280,6 @@ def _agreement(learner: Offline, held: Batch[Segment]) -> Metrics:
     return found | {"judgement_loss": float((share * losses).sum())}
 
 
-def _check_shown(one: Segment, task: ControlTask) -> None:
-    """Raise `ValueError` where a behaviour cannot be cloned."""
-    kind, bounds = kind_of(one), task.action_bounds
-    fault = kind.misfit(one, task) or kind.fault(one) or ("has no step" if not len(one) else "")
-    if not fault and bounds is None and not (np.isin(one.actions, (0, 1)) & (one.actions.sum(1) == 1)[:, None]).all():
-        fault = "has actions that are not one-hot, and those of the task are discrete"
-    if not fault and bounds is not None:
-        low, high = (np.asarray(side) for side in bounds)
-        outside = (one.actions < low - ROUNDING) | (one.actions > high + ROUNDING)
-        if outside.any():
-            step = int(outside.any(1).argmax())
-            fault = f"has the action {one.actions[step]} in step {step}, outside of the bounds {low} to {high}"
-    if fault:
-        raise ValueError(f"the demonstration {one.episode!r} from step {one.start} {fault}: leave it out, or mend it")
-
-
 def _nothing(settings: OfflineSettings) -> str:
     if settings.imitates:
         return f"{settings.kind} learns from demonstrations: set labeler.kind=expert or learner.data, or import some"
@@ -323,11 +296,9 @@ def _data(path: Path | None, task: ControlTask, imitates: bool) -> tuple[Segment
     """The segments of the file, or of the task. Raises `ValueError` where they do not fit the task."""
     if path is None:
         return tuple(task.segments) if isinstance(task, Recorded) else ()
-    found = recording(path).segments
     if imitates:  # any length will do
-        for one in found:
-            _check_shown(one, task)
-        return found
+        return recorded(path, task)
+    found = recording(path).segments
     if misfit := kind_of(found[0]).misfit(found[0], task):
         raise ValueError(f"learner.data: a segment of {path} {misfit}: choose another file or task")
     if all(len(one) < task.segment_steps for one in found):

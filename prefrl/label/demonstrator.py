@@ -20,6 +20,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.exchange.recordings import recording
 from prefrl.judgements import Demonstration
 from prefrl.kinds import kind_of
+from prefrl.label.expert import Expert, ExpertSettings
 from prefrl.protocols import ControlTask, Store, Task, control
 from prefrl.sample.segments import piece
 from prefrl.types import Query, Segment
@@ -32,13 +33,16 @@ class DemonstratorSettings(Settings):
     name: str = Field("demonstrator", min_length=1)
     """Who answers; kept with every answer."""
     data: Path | None = None
-    """What was shown: a folder of demonstrations, an .npz file of segments, or a Minari data set. To be named."""
+    """What was shown: a folder of demonstrations, an .npz of segments, or a Minari data set. Null for whole episodes
+    that are shown first, by `expert`, or that are in the store already."""
+    expert: ExpertSettings = ExpertSettings()
+    """Who shows them, and how many; of no use where `data` is named."""
 
     def build(self, task: Task) -> Demonstrator:
         found = control(task, f"labeler kind {self.kind!r} answers about segments of control")
-        if self.data is None:
-            raise ConfigError("labeler.data: missing; name a folder of demonstrations, made by prefrl demonstrate, say")
-        return Demonstrator(self.name, shown(self.data, found))
+        if self.data is not None:
+            return Demonstrator(self.name, shown(self.data, found))
+        return Demonstrator(self.name, (), self.expert.build(task) if self.expert.episodes else None)
 
 
 def shown(path: Path, task: ControlTask) -> Sequence[Segment]:
@@ -64,18 +68,32 @@ class Demonstrator:
 
     name: str
     shown: Sequence[Segment]
+    expert: Expert | None = None
+    """Who shows whole episodes first."""
     demonstrates: bool = True
 
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
-        """Answer every open query with a random piece of the same length."""
+        """Answer every open query with a random piece of the same length.
+
+        Raises ValueError where nothing was shown that is as long.
+        """
+        if self.expert is not None:
+            self.expert.show(store, rng)
         queries = store.open_queries(self.name)
-        likes = [self._like(query, rng) for query in queries]
+        known = self.shown or [one.like for one in store.demonstrations() if one.query.candidates[0].id == one.like.id]
+        likes = [_like(query, known, rng) for query in queries]
         store.keep(likes)
         store.answer([Demonstration(q.id, like.id, self.name) for q, like in zip(queries, likes, strict=True)])
 
-    def _like(self, query: Query[Segment], rng: np.random.Generator) -> Segment:
-        length = len(query.candidates[0])
-        starts = np.array([max(0, len(one) - length + 1) for one in self.shown])
-        at = int(rng.integers(starts.sum()))  # each piece is as probable as any other
-        which = int(np.searchsorted(starts.cumsum(), at, side="right"))
-        return piece(self.shown[which], at - int(starts[:which].sum()), length)
+
+def _like(query: Query[Segment], known: Sequence[Segment], rng: np.random.Generator) -> Segment:
+    length = len(query.candidates[0])
+    starts = np.array([max(0, len(one) - length + 1) for one in known], int)
+    if not starts.sum():
+        raise ValueError(
+            f"labeler.kind=demonstrator answers with {length} steps of what was shown, and there are none: set "
+            "labeler.data or labeler.expert.episodes, or make task.segment_steps shorter"
+        )
+    at = int(rng.integers(starts.sum()))  # each piece is as probable as any other
+    which = int(np.searchsorted(starts.cumsum(), at, side="right"))
+    return piece(known[which], at - int(starts[:which].sum()), length)

@@ -72,13 +72,14 @@ class Expert:
 
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Show the episodes, once, then answer every open query with what the expert does in its states."""
-        self._show(store, rng)
+        self.show(store, rng)
         queries = store.open_queries(self.name)
         shown = [self._corrected(query) for query in queries]
         store.keep(shown)
         store.answer([Demonstration(q.id, s.id, self.name) for q, s in zip(queries, shown, strict=True)])
 
-    def _show(self, store: Store[Segment], rng: np.random.Generator) -> None:
+    def show(self, store: Store[Segment], rng: np.random.Generator) -> None:
+        """Show the episodes that are not there yet."""
         missing = self.settings.episodes - self._already(store)
         if missing <= 0:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Literal, NamedTuple
@@ -127,6 +128,12 @@ class MLPPolicy:
     def freeze(self) -> None:
         """See observations from now on as they are seen now."""
         self.normaliser.frozen = True
+
+    def with_std_kept(self) -> MLPPolicy:
+        """A view of the same weights that does not learn the standard deviation."""
+        view = copy(self)
+        view._learns_std = False
+        return view
 
     def observe(self, observations: Floats) -> None:
         """Add observations (..., O) to the normaliser's statistics, and let the first layers follow."""

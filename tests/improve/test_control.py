@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.improve.valued import _next_values
 from prefrl.policies.mlp import MLPPolicy
 from prefrl.policies.rollout import Rollout
 from prefrl.reward_models.mlp import MLPSettings
@@ -178,7 +179,7 @@ def test_a_time_limit_bootstraps_from_the_final_observation_and_a_termination_do
         assert isinstance(policy, MLPPolicy)
         unseen = np.array([[False, True, True, True]])
         reading = policy.read(rollout, None, unseen)
-        found = learner._next_values(rollout, reading.values, reading.final, unseen)
+        found = _next_values(rollout, reading.values, reading.final, unseen)
 
         def value(x: float) -> float:
             inputs = torch.from_numpy(policy.normalise(np.array([[x]], np.float32)))

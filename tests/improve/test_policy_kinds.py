@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from control_stubs import Known, point
 from prefrl import Config, Run, load_policy
 from prefrl.components import ConfigError
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
+from prefrl.improve.valued import valued
 from prefrl.policies.rollout import collect
 from prefrl.stages import export_sb3, shrink
 from prefrl.storage.checkpoints import load_state, save_state
@@ -65,7 +67,8 @@ def test_a_minibatch_is_counted_in_steps_however_they_are_cut() -> None:
     learner, rng = built("gru"), np.random.default_rng(0)
     envs = point().environments(4)
     rollout, _ = collect(envs, envs.reset(rng), 30, learner._act(rng))
-    batch, _ = learner._batch(rollout, lambda unseen: learner.policy.read(rollout, None, unseen), rollout.gold)
+    read = partial(learner.policy.read, rollout, None)
+    batch, _ = valued(learner.policy, rollout, read, rollout.gold, discount=0.99, trace=0.95)
     assert len(batch) == 16
     parts = learner._minibatches(batch, 3, rng)
     assert [len(part) for part in parts] == [8] * 6  # 120 steps: two minibatches of about 64

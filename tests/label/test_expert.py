@@ -19,6 +19,7 @@ from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.demonstrator import DemonstratorSettings
 from prefrl.label.expert import Expert, ExpertSettings, _disturbed, play
 from prefrl.protocols import ControlTask
+from prefrl.rundir import Run
 from prefrl.store import Store
 from prefrl.types import Query, Segment
 
@@ -223,6 +224,42 @@ def test_a_demonstrator_answers_with_pieces_of_what_was_shown(pendulum: ControlT
     }
     for one in found:
         np.testing.assert_allclose(one.like.observations[0, 0], float(one.like.episode[-1]) + one.like.start / 100)
+
+
+def test_a_demonstrator_without_a_file_lets_an_expert_show_episodes_and_answers_with_their_pieces(
+    pendulum: ControlTask, tmp_path: Path
+) -> None:
+    with Store[Segment](tmp_path) as store:
+        labeler = DemonstratorSettings(expert=ExpertSettings(episodes=2)).build(pendulum)
+        labeler.answer(store, np.random.default_rng(0))
+        whole = [one.like for one in store.demonstrations()]
+        store.ask([Query((some(),))])
+        labeler.answer(store, np.random.default_rng(0))
+        (answer,) = store.demonstrations()[2:]
+    assert [len(one) for one in whole] == [20, 20]
+    (origin,) = (one for one in whole if one.episode == answer.like.episode)
+    place = slice(answer.like.start, answer.like.start + 5)
+    np.testing.assert_array_equal(answer.like.actions, origin.actions[place])
+
+
+def test_a_run_whose_reward_is_fitted_on_what_was_shown_alone_ends_and_can_be_taken_up(tmp_path: Path) -> None:
+    """There is no judgement to score a refit by."""
+    small = ["task.horizon=20", "learner.environments=2", "learner.steps_per_round=40", "learner.evaluation_episodes=1"]
+    rounds = ["loop.rounds=2", "loop.labels=8", "loop.first_share=0.5", "learner.clone.epochs=1"]
+    with Run(Config.load("control/pendulum-adversarial", small + rounds), tmp_path) as run:
+        found = list(run)
+    assert found[-1].metrics["fit/shown"] == 8
+    assert "improve/shown_loss" in found[-1].metrics
+    with Run.resume(tmp_path) as again:
+        assert list(again) == []
+
+
+def test_a_demonstrator_that_was_shown_nothing_says_so(pendulum: ControlTask, tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store:
+        store.ask([Query((some(),))])
+        labeler = DemonstratorSettings(expert=ExpertSettings(episodes=0)).build(pendulum)
+        with pytest.raises(ValueError, match=r"5 steps of what was shown, and there are none: set labeler\.data"):
+            labeler.answer(store, np.random.default_rng(0))
 
 
 def test_demonstrations_that_are_too_short_or_of_other_sizes_are_refused(pendulum: ControlTask, tmp_path: Path) -> None:
