@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
+from prefrl.envs import exact
 from prefrl.envs.exact import MDP
 from prefrl.envs.toys import INK, MARK, ToyTask
 from prefrl.types import Bools, Floats
@@ -157,10 +158,26 @@ class GridworldSettings(Settings):
         return Tabular(grid.mdp(), grid)
 
 
+class Known(NamedTuple):
+    """What is exact about a policy in a world, a number for each state."""
+
+    regret: float
+    gold: Floats
+    visits: Floats
+    worth: Floats
+
+
+def known(mdp: MDP, policy: Floats) -> Known:
+    """(S, A) of a policy -> its regret; the gold, how often it is in each state, and what it gets from there."""
+    worth = exact.state_values(policy, exact.action_values(mdp, policy))
+    visits = exact.occupancy(mdp, policy).sum(1)
+    return Known(exact.regret(mdp, policy), mdp.rewards.mean(1), visits, worth)
+
+
 def table(act: Callable[[Floats], Floats], states: int) -> Floats:
     """(S, A): what a policy does in each state of a `Tabular`, from observations (n, O) -> actions (n, A), one-hot."""
     found: Floats = act(np.eye(states, dtype=np.float32)).astype(np.float64)
     return found
 
 
-__all__ = ["Grid", "GridworldSettings", "Tabular", "table"]
+__all__ = ["Grid", "GridworldSettings", "Known", "Tabular", "known", "table"]

@@ -16,8 +16,11 @@ import numpy as np
 from prefrl.components import Settings, flat, resume_command
 from prefrl.config import Config
 from prefrl.envs.fast.watched import EnvironmentFault
-from prefrl.evaluate.card import ReportCard
+from prefrl.envs.tabular import MOVES, Tabular, known, table
+from prefrl.envs.toys import ToyTask
+from prefrl.evaluate.card import Exact, Regret, ReportCard
 from prefrl.evaluate.drift import first_judged, read_probes
+from prefrl.evaluate.exactly import keep_exact
 from prefrl.evaluate.grade import grade, of_run
 from prefrl.evaluate.hindsight import FILE as HINDSIGHT
 from prefrl.evaluate.hindsight import hindsight, keep, keep_in, read_from
@@ -26,7 +29,7 @@ from prefrl.evaluate.shift import Yardstick, keep_mistakes
 from prefrl.evaluate.summary import Origin, read_metrics, read_summary, summarise
 from prefrl.judgements import Judged
 from prefrl.loop import Loop
-from prefrl.protocols import Acts, Advises, Attended, Noted, RewardModel, Task, control
+from prefrl.protocols import Acts, Advises, Attended, Noted, RewardModel, StepRewardModel, Task, control
 from prefrl.ranks import lead, rounds, shared
 from prefrl.report.examples import save_examples, score_examples
 from prefrl.report.report import write_report
@@ -196,6 +199,7 @@ class Run:
         if round.evaluated:
             keep(self.folder, round.number, round.evaluated)
             self._measure_mistakes(round)
+            self._measure_exactly(round)
         self._trackers.log(round.number, round.metrics)
         self._checkpoint(round.number)
 
@@ -223,6 +227,35 @@ class Run:
             self._yardstick = Yardstick.of(task, loop.labeler.advice, episodes, rng)
         found = self._yardstick.mistakes(round.number, loop.learner, round.evaluated)
         keep_mistakes(self.folder, found, episodes, task.horizon)
+
+    def _measure_exactly(self, round: Round) -> None:
+        """What is exact about the policy and the reward, where states are cells that are all known."""
+        task, learner, reward = self.loop.task, self.loop.learner, self.loop.reward
+        if not isinstance(task, ToyTask) or not isinstance(task.world, Tabular) or not isinstance(learner, Acts):
+            return
+        if (grid := task.world.grid) is None or not isinstance(reward, StepRewardModel):
+            return
+        states, actions = task.world.mdp.rewards.shape
+        act = learner.actor()
+        policy = table(lambda observed: act(observed, None, None)[0], states)
+        found = known(task.world.mdp, policy)
+        seen = np.eye(states, dtype=np.float32).repeat(actions, 0)[:, None]  # (SA, 1, S)
+        done = np.tile(np.eye(actions, dtype=np.float32), (states, 1))[:, None]
+        learned = reward.rewards(seen, done).reshape(states, actions).mean(1)
+        keep_exact(
+            self.folder,
+            Exact(
+                rows=grid.rows,
+                cells=tuple(grid.cells),
+                gold=found.gold.tolist(),
+                learned=learned.tolist() if reward.fitted else [],
+                visits=found.visits.tolist(),
+                worth=found.worth.tolist(),
+                discount=task.world.mdp.discount,
+                moves=tuple(MOVES[action] for action in policy.argmax(1)),
+                rounds=(Regret(round=round.number, regret=found.regret),),
+            ),
+        )
 
     def _save_examples(self, round: Round) -> None:
         """A few candidates to look at, of the starting policy and of the newest one."""

@@ -1,11 +1,11 @@
 """What a report card of a reward model says, and what it says of a run's rounds: plain data, as it lies in `card.json`,
-`hindsight.json` and `shift.json`. What is not defined says why."""
+`hindsight.json`, `shift.json` and `exact.json`. What is not defined says why."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from prefrl.stats.estimates import Estimate, Number, Part, Words
 
@@ -223,3 +223,42 @@ class Shift(Part):
     every: int
     """Steps that a point is the mean of."""
     rounds: tuple[Mistakes, ...]
+
+
+class Regret(Part):
+    """How far a round's policy is from the best one."""
+
+    round: int
+    regret: Number
+    """A share of the span between the best and the worst policy."""
+
+
+class Exact(Part):
+    """A run in a world whose states are cells and all known: the regret of each round, and maps of the newest."""
+
+    rows: tuple[Words, ...]
+    """The grid from above."""
+    cells: tuple[tuple[int, int], ...]
+    """Row and column of each state, of which all that follows has one number."""
+    gold: Points
+    learned: Points
+    """Mean rewards over actions."""
+    visits: Points
+    """The share of a discounted lifetime that the policy spends there."""
+    worth: Points
+    """Its discounted return from there, in gold."""
+    moves: tuple[tuple[int, int], ...]
+    """Where it goes, as rows and columns."""
+    discount: Number
+    """What both are discounted by in a step."""
+    rounds: tuple[Regret, ...]
+
+    @model_validator(mode="after")
+    def _of_one_grid(self) -> Exact:
+        """Each state lies on the grid, and has a number of each kind, where there are any."""
+        counts = {len(one) for one in (self.gold, self.learned, self.visits, self.worth, self.moves) if one}
+        if counts != {len(self.cells)} or any(not 0 <= i < len(self.rows) for i, _ in self.cells):
+            raise ValueError(f"expected a number for each of {len(self.cells)} cells of the grid, got {sorted(counts)}")
+        if any(not 0 <= j < len(self.rows[i]) for i, j in self.cells):
+            raise ValueError("expected cells within their rows")
+        return self

@@ -63,6 +63,7 @@ def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
     found: tuple[Chapter, ...] = (
         Chapter("Did it help?", (*_learning(record, facts), *_drift(record, facts))),
         Chapter("Does it follow the expert?", _shifting(record)),
+        Chapter("How far from the best?", _exactly(record)),
         Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
         Chapter("How did it learn?", _training(record)),
         Chapter("What did it cost?", _cost(record, facts)),
@@ -321,6 +322,46 @@ def _shifting(record: Record) -> tuple[Card, ...]:
                 log=True,
             ),
             f"The same errors added up, both axes logarithmic. {_compounding(sums[-1][-1], eps, ends[-1])}",
+        ),
+    )
+
+
+def _exactly(record: Record) -> tuple[Card, ...]:
+    """Regret, and maps of reward, policy and value, where all of a world is known."""
+    exact = record.exact
+    if exact is None or not exact.rounds:
+        return ()
+    numbers, regrets = [one.round for one in exact.rounds], [one.regret for one in exact.rounds]
+
+    def drawn(name: str, values: Sequence[float], moves: Sequence[tuple[int, int]] = ()) -> Markup:
+        return plots.cells(f"exact-{name}", exact.rows, exact.cells, values, moves)
+
+    return (
+        Card(
+            "Regret",
+            plots.lines("exact-regret", numbers, [Line(regrets, "improve")], percent=True, zero=True),
+            "How much of the way from the best policy down to the worst a round's policy lies behind, computed from the "
+            f"world's tables and not played. The newest misses {regrets[-1]:.1%}.",
+        ),
+        Card(
+            "Gold of each cell",
+            drawn("gold", exact.gold),
+            "The reward of a step from each cell, which nothing that learns sees. Letters are those of task.rows.",
+        ),
+        Card(
+            "What was learned of it",
+            drawn("learned", exact.learned),
+            "The newest reward model's, the mean over actions. Zero and scale are its own: compare the pattern.",
+        ),
+        Card(
+            "Where the policy goes, and how often it is there",
+            drawn("visits", exact.visits, exact.moves),
+            f"The share of its time in each cell, with a discount of {exact.discount:g} a step. Arrows are its moves.",
+        ),
+        Card(
+            "What each cell is worth to it",
+            drawn("worth", exact.worth, exact.moves),
+            f"The gold that it earns from there on, with a discount of {exact.discount:g} a step.",
         ),
     )
 

@@ -14,6 +14,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, NullFormatter, PercentFormatter
 
 from prefrl.evaluate.card import Bin
@@ -148,6 +149,38 @@ def _log_axes(axes: Axes) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))  # and no powers, which are pictures
         axis.set_minor_formatter(NullFormatter())
     axes.minorticks_off()
+
+
+def cells(
+    name: str,
+    rows: Sequence[str],
+    places: Sequence[tuple[int, int]],
+    values: Sequence[float],
+    moves: Sequence[tuple[int, int]] = (),
+) -> Markup:
+    """A map of one number for each cell of a grid, with arrows where there are moves; empty without numbers."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        top = max(map(abs, values)) or 1.0
+        for number, ((i, j), value) in enumerate(zip(places, values, strict=True)):
+            shade = COLOURS["learned" if value >= 0 else "gold"]
+            axes.add_patch(Rectangle((j, i), 1, 1, facecolor=shade, alpha=0.75 * abs(value) / top, linewidth=0))
+            letter = rows[i][j] if rows[i][j] not in ".S" else ""
+            axes.text(j + 0.08, i + 0.24, letter, fontsize=9, fontweight="bold")
+            axes.text(j + 0.5, i + 0.78, f"{value:.2g}", ha="center", fontsize=8.5)
+            if moves and rows[i][j] != "G":
+                down, right = 0.17 * moves[number][0], 0.2 * moves[number][1]
+                tail, head = (j + 0.5 - right, i + 0.32 - down), (j + 0.5 + right, i + 0.32 + down)
+                axes.annotate("", head, tail, arrowprops={"arrowstyle": "-|>", "color": COLOURS["ink"], "lw": 1.1})
+        for i, row in enumerate(rows):
+            for j, kind in enumerate(row):
+                face = COLOURS["rule"] if kind == "#" else "none"
+                axes.add_patch(Rectangle((j, i), 1, 1, facecolor=face, edgecolor=COLOURS["rule"], linewidth=0.8))
+        axes.set(xlim=(0, len(rows[0])), ylim=(len(rows), 0), aspect="equal")
+        axes.axis("off")
+
+    return _svg(name, draw) if values else Markup("")
 
 
 def strips(name: str, found: Sequence[Strip], label: str) -> Markup:

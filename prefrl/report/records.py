@@ -18,7 +18,7 @@ import yaml
 from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import Bin, Hindsight, ReportCard, Shift
+from prefrl.evaluate.card import Bin, Exact, Hindsight, ReportCard, Shift
 from prefrl.stats.estimates import Part
 from prefrl.types import Json
 
@@ -72,6 +72,8 @@ class Record:
     """All rounds by the newest reward, where that was measured."""
     shift: Shift | None
     """How far the policy is from an expert, where that was measured."""
+    exact: Exact | None
+    """What is known exactly, in a world of few states."""
     labels: Json
     """What was asked and answered, of a folder of answers alone."""
     missing: tuple[str, ...]
@@ -127,6 +129,7 @@ def read(folder: Path, examples: bool = True) -> Record:
         card=_part(ReportCard, folder / "card.json", missing),
         hindsight=_part(Hindsight, folder / "hindsight.json", missing),
         shift=_part(Shift, folder / "shift.json", missing),
+        exact=_part(Exact, folder / "exact.json", missing),
         labels=_json(folder / "labels.json", dict, [], ""),
         missing=tuple(missing),
     )

@@ -271,6 +271,22 @@ def test_mistakes_are_added_up_beside_the_lines_of_the_measured_eps(tmp_path: Pa
     assert "shift.json: cannot be read" in page(folder).text
 
 
+def test_a_world_that_is_known_exactly_has_maps_and_a_regret(tmp_path: Path) -> None:
+    cells = [[0, 0], [0, 1], [1, 1]]
+    found: dict[str, Any] = {"rows": ["S.", "#G"], "cells": cells, "gold": [0, 0, 1], "learned": [], "discount": 0.95}
+    found |= {"visits": [0.2, 0.3, 0.5], "worth": [1.1, 1.5, 2.0], "moves": [[0, 1], [1, 0], [0, 1]]}
+    found["rounds"] = [{"round": 0, "regret": 0.4}, {"round": 1, "regret": 0.025}]
+    folder = run_folder(tmp_path / "run", [line(i) for i in range(2)], summary=summary())
+    (folder / "exact.json").write_text(json.dumps(found))
+    text = page(folder).text
+    assert "The newest misses 2.5%." in text
+    assert "Where the policy goes, and how often it is there" in text
+    assert "What was learned of it" not in text  # nothing was fitted, and the run is over
+    for wrong in ({"worth": [1.0]}, {"cells": [[0, 0], [0, 1], [2, 1]]}, {"cells": [[0, 0], [0, 1], [1, 2]]}):
+        (folder / "exact.json").write_text(json.dumps(found | wrong))
+        assert "exact.json: cannot be read" in page(folder).text
+
+
 def test_each_of_several_tasks_has_a_curve(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/gold/mars": 1.0 * i, "evaluate/gold/<blink>earth": -1.0}) for i in range(4)]
     found = page(run_folder(tmp_path / "run", lines, summary=summary()))
