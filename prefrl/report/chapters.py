@@ -340,8 +340,8 @@ def _exactly(record: Record) -> tuple[Card, ...]:
         Card(
             "Regret",
             plots.lines("exact-regret", numbers, [Line(regrets, "improve")], percent=True, zero=True),
-            "How much of the way from the best policy down to the worst a round's policy lies behind, computed from the "
-            f"world's tables and not played. The newest misses {regrets[-1]:.1%}.",
+            "By how much of the way from the best policy down to the worst a round's policy lies behind; computed from "
+            f"the world's tables, not played. The newest misses {regrets[-1]:.1%}.",
         ),
         Card(
             "Gold of each cell",
