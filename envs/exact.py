@@ -1,8 +1,8 @@
 """What is exact in a world with few states: distributions, values, improvement, gradients and regret.
 
 A policy is a table (S, A) of probabilities. Under it the pairs of a state and an action are a Markov chain, and all
-that reinforcement learning is about is linear algebra over that chain: mu_{t+1} = T mu_t, J = sum_t gamma^t mu_t . r,
-and Q = r + gamma T' Q. Source: Puterman 1994, chapters 5 and 6; Sutton et al. 2000 (theorem 1) for the gradient. It is
+that reinforcement learning is about is linear algebra over that chain: mu_{t+1} = mu_t T, J = sum_t gamma^t mu_t . r,
+and Q = r + gamma T Q. Source: Puterman 1994, chapters 5 and 6; Sutton et al. 2000 (theorem 1) for the gradient. It is
 the oracle of the tests of `prefrl/improve/objectives.py`, and what docs/theory.md draws. float64 throughout, for S x A
 up to a few thousand.
 """
@@ -92,7 +92,7 @@ def occupancy(mdp: MDP, policy: Floats) -> Floats:
 
 
 def action_values(mdp: MDP, policy: Floats) -> Floats:
-    """(S, A): Q, the discounted return of an action and then the policy; Q = r + gamma T' Q."""
+    """(S, A): Q, the discounted return of an action and then the policy; Q = r + gamma T Q."""
     operator = np.eye(mdp.rewards.size) - mdp.discount * chain(mdp, policy)
     found: Floats = np.linalg.solve(operator, mdp.rewards.ravel()).reshape(policy.shape)
     return found

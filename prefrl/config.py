@@ -153,7 +153,7 @@ class Config(Settings):
         labeler = self.build_labeler(task)
         self._check_labeler(labeler, learner)
         if isinstance(learner, NeedsShowing):
-            learner.check_shown(isinstance(labeler, Demonstrates) or bool(store.demonstrations()))
+            learner.check_shown(_shows(labeler) or bool(store.demonstrations()))
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)
@@ -176,7 +176,7 @@ class Config(Settings):
     def _check_labeler(self, labeler: Labeler, learner: Learner) -> None:
         """Raises `ConfigError` where the labeler cannot answer about so many candidates, or nobody learns from it."""
         count = cast(SelectorSettings, self.select).candidates
-        shows = isinstance(labeler, Demonstrates) and labeler.demonstrates
+        shows = _shows(labeler)
         if self.loop.labels and shows != (count == 1):
             says = "shows what to do in the states of one" if shows else "compares two or more"
             raise ConfigError(
@@ -253,6 +253,10 @@ def read_settings(source: str | Path) -> Json:
 def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
     mark = error.problem_mark or error.context_mark
     return f"{source}, line {mark.line + 1}" if mark else str(source)
+
+
+def _shows(labeler: Labeler) -> bool:
+    return isinstance(labeler, Demonstrates) and labeler.demonstrates
 
 
 def placed(line: str, source: str | Path, given: Sequence[list[str]]) -> str:

@@ -318,6 +318,10 @@ class Advises(Protocol):
     def advice(self) -> Callable[[Floats], Floats]:
         """Observations (n, O) -> actions (n, A), within the bounds, or one-hot."""
 
+    @property
+    def wavers(self) -> bool:
+        """Whether it does not do so in all of its own episodes, and so is no measure."""
+
 
 class LabelerSettings(Protocol):
     """What chooses a labeler."""

@@ -219,7 +219,7 @@ class Run:
     def _measure_mistakes(self, round: Round) -> None:
         """How far the policy is from the expert, where one answers: it plays once, and nothing learns from that."""
         loop = self.loop
-        if not isinstance(loop.labeler, Advises) or not isinstance(loop.learner, Acts):
+        if not isinstance(loop.labeler, Advises) or not isinstance(loop.learner, Acts) or loop.labeler.wavers:
             return
         episodes, task = len(round.evaluated), control(loop.task, "an expert advises in control")
         if self._yardstick is None:

@@ -168,7 +168,7 @@ class ControlLearnerSettings(Settings):
             if (came := getattr(self, name)) != value:
                 raise ValueError(
                     f".{name}: expected {'null' if value is None else value} with policy.kind=flow, got {came}: a flow "
-                    "gives no log-probability, and so neither an entropy nor a KL; leave it out"
+                    "has no density that is known, and so neither an entropy nor a KL: set it so"
                 )
         if min(self.rollout_lengths()) < self.policy.execute:
             raise ValueError(

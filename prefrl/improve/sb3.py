@@ -394,7 +394,8 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
             network, env, policy_kwargs=kwargs, device=device, verbose=0, **options
         )
     except TypeError as error:  # an option that its constructor does not have
-        raise ConfigError(f"learner.options: stable-baselines3's {settings.algorithm} says: {error}") from error
+        where = "policy" if "Policy" in str(error) else "options"  # it names whose constructor that was
+        raise ConfigError(f"learner.{where}: stable-baselines3's {settings.algorithm} says: {error}") from error
 
 
 def _check_steps(settings: SB3Settings) -> None:

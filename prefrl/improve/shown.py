@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import ConfigError, Settings
@@ -73,6 +73,12 @@ class ImitationSettings(Settings):
     """What that weight is multiplied by from round to round."""
     learn_std: bool = False
     """Learn the std of continuous actions from what is shown as well."""
+
+    @model_validator(mode="after")
+    def _used(self) -> ImitationSettings:
+        if self.data is not None and not self.on:
+            raise ValueError(f".data: {self.data} is of no use while epochs and keep are 0: set one of them")
+        return self
 
     @property
     def on(self) -> bool:

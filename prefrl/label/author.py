@@ -17,6 +17,9 @@ from prefrl.judgements import Demonstration
 from prefrl.protocols import Authored, Store, Task, text
 from prefrl.types import Query, Response
 
+TRIES = 20
+"""For each text that is wanted, since some come twice."""
+
 
 class AuthorSettings(Settings):
     """Show good texts, once, before anything is learned: each is the best by gold of a few that the task can write."""
@@ -28,6 +31,9 @@ class AuthorSettings(Settings):
     """How many are shown; those that are there already count."""
     best_of: int = Field(8, ge=1)
     """Of so many drafts, each with a prompt of its own, the one with the highest gold is shown; 1 for any."""
+
+    def shrunk(self) -> AuthorSettings:
+        return self.model_copy(update={"texts": min(self.texts, 4), "best_of": min(self.best_of, 2)})
 
     def build(self, task: Task) -> Author:
         found = text(task, f"labeler kind {self.kind!r} writes texts")
@@ -69,7 +75,13 @@ class Author:
 def drafts(task: Authored, count: int, best_of: int, rng: np.random.Generator) -> list[Response]:
     """So many different texts, each the best of a few, with their gold."""
     found: dict[str, Response] = {}
+    tries = 0
     while len(found) < count:
+        if (tries := tries + 1) > TRIES * count:
+            raise ValueError(
+                f"labeler.texts: the task wrote only {len(found)} different texts in {TRIES * count} tries, and "
+                f"{count} are to be shown: ask for fewer"
+            )
         written = task.written(best_of, rng)
         golds = task.gold(written)
         best = int(golds.argmax())

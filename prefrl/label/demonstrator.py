@@ -22,7 +22,7 @@ from prefrl.judgements import Demonstration
 from prefrl.kinds import kind_of
 from prefrl.label.expert import Expert, ExpertSettings
 from prefrl.protocols import ControlTask, Store, Task, control
-from prefrl.sample.segments import piece
+from prefrl.sample.segments import piece, placed
 from prefrl.types import Query, Segment
 
 
@@ -59,7 +59,7 @@ def shown(path: Path, task: ControlTask) -> Sequence[Segment]:
             f"labeler.data: no demonstration of {path} has task.segment_steps={task.segment_steps} steps: make them "
             "shorter, or choose another one"
         )
-    return segments
+    return placed(task, segments)
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,13 @@ class Demonstrator:
 
 
 def _like(query: Query[Segment], known: Sequence[Segment], rng: np.random.Generator) -> Segment:
-    length = len(query.candidates[0])
+    length, context = len(query.candidates[0]), query.candidates[0].context
+    known = [one for one in known if one.context == context]  # of several tasks, its own
     starts = np.array([max(0, len(one) - length + 1) for one in known], int)
     if not starts.sum():
+        where = f" in {context}" if context else ""
         raise ValueError(
-            f"labeler.kind=demonstrator answers with {length} steps of what was shown, and there are none: set "
+            f"labeler.kind=demonstrator answers with {length} steps of what was shown{where}, and there are none: set "
             "labeler.data or labeler.expert.episodes, or make task.segment_steps shorter"
         )
     at = int(rng.integers(starts.sum()))  # each piece is as probable as any other

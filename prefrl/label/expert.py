@@ -21,7 +21,7 @@ from prefrl.judgements import Demonstration
 from prefrl.policies.origin import actor_of
 from prefrl.policies.rollout import whole_episodes
 from prefrl.protocols import ControlTask, Store, Task, simulated
-from prefrl.sample.segments import segment
+from prefrl.sample.segments import placed, segment
 from prefrl.types import Bools, Floats, Query, Segment
 
 Advice: TypeAlias = Callable[[Floats], Floats]
@@ -69,6 +69,10 @@ class Expert:
     @property
     def name(self) -> str:
         return self.settings.name
+
+    @property
+    def wavers(self) -> bool:
+        return self.moods is not None
 
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Show the episodes, once, then answer every open query with what the expert does in its states."""
@@ -146,7 +150,7 @@ def play(
     shown = replace(rollout, actions=rollout.choices)
     # A row may go on after its first end.
     lengths = rollout.ends.argmax(1) + 1
-    return [segment(shown, i, 0, int(lengths[i]), settings.name) for i in range(episodes)]
+    return placed(task, [segment(shown, i, 0, int(lengths[i]), settings.name) for i in range(episodes)])
 
 
 def _disturbed(actions: Floats, task: ControlTask, width: float, rng: np.random.Generator) -> Floats:

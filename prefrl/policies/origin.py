@@ -79,6 +79,10 @@ def _flow(folder: Path, task: ControlTask, settings: FlowPolicySettings) -> Stat
     checkpoint, _ = newest(folder)
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
     there, wanted = said["learner"].get("policy") or {}, settings.model_dump(mode="json")
+    if there.get("kind") != settings.kind:
+        raise ConfigError(
+            f"learner.start: the policy of {folder} is no flow: leave learner.policy.kind out, or name a run of a flow"
+        )
     # How a plan is made and measured is no part of the network.
     other = [name for name in sorted(OF_NETWORKS) if there.get(name) != wanted[name]]
     if other:
@@ -114,7 +118,8 @@ def _of_run(folder: Path) -> _Found:
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
     network = said["learner"].get("policy") or {}  # null for the perceptron of a clone
     if ours and (network.get("kind", "mlp"), network.get("activation", "tanh")) != ("mlp", "tanh"):
-        raise ConfigError(f"{folder} has another network, {network}; expected kind mlp with tanh")
+        named = " with ".join(network[name] for name in ("kind", "activation") if network.get(name))
+        raise ConfigError(f"{folder} has a policy of kind {named}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
         raise ConfigError(f"{folder} holds no policy of control that can be taken over; expected {OURS}")
     task, squash = task_of(said), squashes(said["learner"])

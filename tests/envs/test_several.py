@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import pytest
 from prefrl import Config, Run
 from prefrl.components import ConfigError
 from prefrl.envs.several import SeveralSettings, SeveralTask
-from prefrl.label.expert import ExpertSettings
+from prefrl.label.demonstrator import Demonstrator
+from prefrl.label.expert import ExpertSettings, play
+from prefrl.sample.segments import piece
 from prefrl.store import Store
-from prefrl.types import Segment
+from prefrl.types import Floats, Query, Segment
 
 LENGTHS: dict[str, Any] = {"horizon": 12, "segment_steps": 3}
 CAR: dict[str, Any] = {"env": "MountainCar-v0", **LENGTHS}
@@ -96,3 +99,19 @@ def test_a_run_compares_within_a_task_and_reports_each(tmp_path: Path) -> None:
     contexts = [{one.context for one in each.query.candidates} for each in judged]
     assert all(len(each) == 1 for each in contexts)
     assert set.union(*contexts) == {"moon", "mars", "earth"}
+
+
+def test_what_was_shown_in_a_task_answers_queries_of_that_task_alone(tmp_path: Path) -> None:
+    task, rng = several(car=CAR, arm=ARM), np.random.default_rng(0)
+
+    def waits(observations: Floats) -> Floats:
+        return np.eye(3, dtype=np.float32)[np.zeros(len(observations), int)]
+
+    shown = play(task, waits, 4, rng, ExpertSettings())
+    assert {one.context for one in shown} == {"car", "arm"}
+    with Store[Segment](tmp_path) as store:
+        own = [replace(piece(one, 2, 3), actions=one.actions[2:5] * 0 + [0, 1, 0]) for one in shown]
+        store.ask([Query((one,)) for one in own])
+        Demonstrator("known", shown).answer(store, rng)
+        answered = store.demonstrations()
+    assert [one.like.context for one in answered] == [one.context for one in own]

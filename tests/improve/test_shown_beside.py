@@ -206,3 +206,8 @@ def test_demonstrations_of_other_spaces_are_refused_by_name(tmp_path: Path, stor
 def test_a_policy_that_cannot_be_cloned_here_is_refused(policy: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="clone needs a policy of kind mlp without sde"):
         ControlLearnerSettings.model_validate({"policy": policy, "clone": {"keep": 0.1}})
+
+
+def test_a_file_that_nothing_is_to_be_done_with_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"learner\.clone\.data: .* is of no use while epochs and keep are 0"):
+        Config.load("control/pendulum", ["learner.clone.data=shown"])

@@ -39,6 +39,15 @@ def test_the_best_of_more_drafts_is_better(toy_reviews: Reviews) -> None:
     assert toy_reviews.gold(best).mean() > toy_reviews.gold(any_).mean() + 0.5
 
 
+def test_a_task_that_writes_too_few_different_texts_is_said_so(
+    toy_reviews: Reviews, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (one,) = drafts(toy_reviews, 1, 1, np.random.default_rng(0))
+    monkeypatch.setattr(Reviews, "written", lambda *_: [one])
+    with pytest.raises(ValueError, match="only 1 different texts in 40 tries, and 2 are to be shown"):
+        drafts(toy_reviews, 2, 1, np.random.default_rng(0))
+
+
 def test_questions_about_others_texts_and_tasks_without_a_writer_are_refused(
     toy_reviews: Reviews, tmp_path: Path
 ) -> None:

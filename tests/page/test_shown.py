@@ -75,7 +75,7 @@ def test_actions_are_stored_with_the_policys_own_states(service: Service, ann: T
     np.testing.assert_array_equal(one.like.states, own.states)
     assert (one.like.episode, one.like.gold, one.demonstration.labeler) == (own.episode, None, "ann")
     assert one.implied(1.0) is not None
-    assert service.store.counts() == {"asked": 5, "answered": 1, "skipped": 0}
+    assert service.store.counts() == {"asked": 5, "answered": 1, "skipped": 0, "demonstrations": 1}
 
 
 def test_who_agrees_with_every_step_shows_the_policys_own_clip(service: Service, ann: TestClient) -> None:
