@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest, todays
-from prefrl.fit.settings import FittingSettings, check_settings
+from prefrl.fit.settings import FittingSettings, check_settings, check_shown
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
@@ -154,6 +154,8 @@ class Config(Settings):
         self._check_labeler(labeler, learner)
         if isinstance(learner, NeedsShowing):
             learner.check_shown(isinstance(labeler, Demonstrates) or bool(store.demonstrations()))
+        shows = isinstance(labeler, Demonstrates) and labeler.demonstrates
+        check_shown(self.fitting, shows or bool(store.demonstrations()))
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)
