@@ -1,7 +1,7 @@
 """Cloning an expert who swings a pendulum up: prefrl against imitation on the same demonstrations.
 
     python benchmarks/demos_pendulum.py --method clone|noise|dagger|adversarial [--seeds 5] [--first 100] [--short]
-        [--peers .venv-peers-control/bin/python] [--alone]
+        [--peers .venv-peers-control/bin/python] [--alone] [--settings KEY=VALUE ...]
 
 `clone`: four episodes of the expert, 800 answered steps; `noise`: the same with noise in what is executed (DART);
 `dagger`: one episode, and 600 steps of the learner's own that the expert answers. imitation's BC is given the same
@@ -12,7 +12,7 @@ large and the same network. 20 episodes of the policy's mode are scored. The las
 `adversarial`: control/pendulum-adversarial, which has four clean episodes, against imitation's GAIL on the same
 episodes for as many steps from a random start, as is usual there. `early` is the return after at most 30,000 steps of
 the policy's own and `gold` the one at the end, after about 120,000; our CPU seconds hold all evaluations.
-`--alone` leaves the peer out.
+`--alone` leaves the peer out; `--settings` changes the preset of `adversarial`.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="one seed")
     parser.add_argument("--alone", action="store_true", help="without the peer")
     parser.add_argument("--peers", default=".venv-peers-control/bin/python", help="Python that has imitation")
+    parser.add_argument("--settings", nargs="*", default=[], help="settings beside the preset's, for adversarial")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
@@ -67,7 +68,7 @@ def main() -> None:
     found: dict[str, list[dict[str, float]]] = {"ours": [], "peer": []}
     for seed in range(options.first, options.first + (1 if options.short else options.seeds)):
         with tempfile.TemporaryDirectory() as folder:
-            mine = adversary(Path(folder), seed) if options.method == "adversarial" else None
+            mine = adversary(Path(folder), seed, options.settings) if options.method == "adversarial" else None
             found["ours"].append(mine or ours(options.method, Path(folder), seed))
             print(f"seed {seed}: ours {found['ours'][-1]}", flush=True)
             if not options.alone:
@@ -134,7 +135,7 @@ def keep(folder: Path, shown: Sequence[Segment]) -> None:
     np.savez(folder / "shown.npz", seen=[s.observations for s in shown], done=[s.actions for s in shown])
 
 
-def adversary(folder: Path, seed: int) -> dict[str, float]:
+def adversary(folder: Path, seed: int, settings: Sequence[str]) -> dict[str, float]:
     """A run of the preset; what its expert showed is left in `folder` for the peer."""
     import torch
 
@@ -143,19 +144,20 @@ def adversary(folder: Path, seed: int) -> dict[str, float]:
     from prefrl.types import Segment
 
     torch.set_num_threads(1)
-    config = Config.load("control/pendulum-adversarial", [f"seed={seed}", f"learner.evaluation_episodes={EPISODES}"])
+    own = [f"seed={seed}", f"learner.evaluation_episodes={EPISODES}", *settings]
+    config = Config.load(SETTINGS["adversarial"][0], own)
     early, begin = math.nan, time.process_time()
     with Store[Segment](folder / "store") as store:
         for done in config.build(store).run():
-            own = done.metrics["steps/learn"] + done.metrics["steps/query"]
-            early = done.metrics["evaluate/gold"] if own <= EARLY else early
+            steps = done.metrics["steps/learn"] + done.metrics["steps/query"]
+            early = done.metrics["evaluate/gold"] if steps <= EARLY else early
         cpu = time.process_time() - begin
         shown = [one.like for one in store.demonstrations() if one.like.id == one.query.candidates[0].id]
     keep(folder, shown)
     return {
         "early": round(early, 1),
         "gold": round(done.metrics["evaluate/gold"], 1),
-        "steps": own,
+        "steps": steps,
         "cpu": round(cpu, 1),
     }
 

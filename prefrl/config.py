@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest, todays
-from prefrl.fit.settings import FittingSettings, check_settings
+from prefrl.fit.settings import FittingSettings, check_settings, check_shown
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
@@ -152,8 +152,11 @@ class Config(Settings):
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         labeler = self.build_labeler(task)
         self._check_labeler(labeler, learner)
-        if isinstance(learner, NeedsShowing):
-            learner.check_shown(_shows(labeler) or bool(store.demonstrations()))
+        if store is not None:  # which is with the first of several ranks alone
+            shows = _shows(labeler) or bool(store.demonstrations())
+            check_shown(self.fitting, shows)
+            if isinstance(learner, NeedsShowing):
+                learner.check_shown(shows)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(learner, Particular):
             learner.check_reward(reward)

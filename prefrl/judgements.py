@@ -149,6 +149,15 @@ class Demonstrated(Generic[C]):
         if self.like.context != self.query.candidates[0].context:
             raise ValueError(f"query {self.query.id[:12]} is answered by a behaviour of another context (prompt)")
 
+    def told_apart(self, weight: float) -> list[Judged[C]]:
+        """That the one was shown and the other is the learner's own, each for itself, as ratings on a scale of two: a
+        discriminator's labels (Ho and Ermon 2016). Nothing where a behaviour stands for itself."""
+        if self.implied(weight) is None:
+            return []
+        shown, piles = self.demonstration, (self.query, Query((self.like,)))
+        weight *= shown.weight
+        return [Judged(q, Rating(q.id, (level,), 2, shown.labeler, weight=weight)) for level, q in enumerate(piles)]
+
     def implied(self, weight: float) -> Judged[C] | None:
         """That what was shown is better than the learner's own (Ibarz et al. 2018), with `weight` times the weight of
         the demonstration; None where a behaviour stands for itself."""

@@ -124,6 +124,20 @@ def test_nothing_that_learns_sees_the_gold(name: str, ways: tuple[str, ...], tmp
     assert learned(blind) == learned(seeing)
 
 
+def test_a_discriminator_of_what_was_shown_does_not_see_the_gold(tmp_path: Path) -> None:
+    short = [
+        "task.horizon=20", "learner.environments=2", "learner.steps_per_round=40", "learner.evaluation_episodes=1",
+        "loop.rounds=2", "loop.labels=8", "loop.first_share=0.5", "learner.clone.epochs=1", "fitting.shown_as=piles",
+    ]  # fmt: skip
+    config = Config.load("control/pendulum-adversarial", short)
+    seeing, blind = (config.build(SQLStore[Any](tmp_path / name)) for name in ("seeing", "blind"))
+    hide_gold(blind.task)
+    blind.learner = Blind(blind.learner)
+    list(seeing.run())
+    assert all(np.isnan(r.metrics["evaluate/gold"]) for r in blind.run())
+    assert learned(blind) == learned(seeing)
+
+
 def hide_gold(task: Any) -> None:
     """Make the task itself give NaN: environments' rewards, or the scorer of texts."""
     if task.kind == "text":

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from prefrl.fit import losses
 from prefrl.fit.metrics import Answering
-from prefrl.fit.settings import Reliability, Ties
+from prefrl.fit.settings import FittingSettings, Ties
 from prefrl.fit.terms import Choices, Ratings, Terms
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Metrics
@@ -27,15 +27,19 @@ class Likelihood:
     rating scale's levels begin, and how often each labeler errs. They start anew with every fit.
     """
 
-    def __init__(self, members: int, terms: Terms, ties: Ties, error_rate: float, reliability: Reliability) -> None:
-        self._ties: Ties = ties if terms.choices.tied.any() else "half"  # without ties, the limit that none are called
-        self._error_rate, self._labelers = error_rate, terms.labelers
+    def __init__(self, members: int, terms: Terms, fitting: FittingSettings) -> None:
+        # Without ties, the limit that none are called.
+        self._ties: Ties = fitting.ties if terms.choices.tied.any() else "half"
+        self._error_rate, self._labelers = fitting.error_rate, terms.labelers
         where, start = terms.labeler.device, math.log(START / (1 - START))
         self.tie = torch.zeros(members, device=where, requires_grad=self._ties != "half")
         # Logarithms of the gaps, so that thresholds increase whatever values these take.
-        self.first_threshold = torch.full((members, 1), -1.0, device=where, requires_grad=terms.scale > 0)
+        # A discriminator's score is its logit: what a threshold could add is in the network's own offset.
+        piles = fitting.shown_as == "piles" and terms.scale == 2
+        start_level, learned_level = 0.0 if piles else -1.0, terms.scale > 0 and not piles
+        self.first_threshold = torch.full((members, 1), start_level, device=where, requires_grad=learned_level)
         self.gaps = torch.zeros(members, max(terms.scale - 2, 0), device=where, requires_grad=terms.scale > 2)
-        shape, learned = (members, len(terms.labelers)), reliability == "learned"
+        shape, learned = (members, len(terms.labelers)), fitting.reliability == "learned"
         self.errors = torch.full(shape, start, device=where, requires_grad=learned)
 
     def parameters(self) -> list[Tensor]:

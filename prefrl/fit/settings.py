@@ -40,6 +40,9 @@ class FittingSettings(Settings):
     """Leave out judgements that the model finds improbable, and turn round those it finds all but impossible (RIME)."""
     demonstrations: float = Field(1.0, ge=0)
     """What it counts, beside judgements, that a demonstration is better than what it answers; 0 leaves that out."""
+    shown_as: Literal["pairs", "piles"] = "pairs"
+    """What a demonstration says: that it is better than what it answers; or, as to a discriminator (GAIL), that it is
+    of one pile and what it answers of the other, with a logistic loss of each. Ratings beside it need two levels."""
     newest: int | None = Field(None, ge=1)
     """Fit on so many of the newest judgements alone, and on what so many of the newest demonstrations imply; null for
     all of them. For answers that grow old as the policy changes, as a demonstrator's do."""
@@ -77,6 +80,16 @@ class FittingSettings(Settings):
         return self
 
 
+def check_shown(fitting: FittingSettings, shows: bool) -> None:
+    """Raise `ConfigError` for a discriminator without anything to tell apart: `shows` says whether there are, or will
+    be, demonstrations."""
+    if fitting.shown_as == "piles" and not (shows and fitting.demonstrations):
+        raise ConfigError(
+            "fitting.shown_as=piles tells what was shown from the learner's own, and nothing shown counts: choose a "
+            "labeler that shows what to do (labeler.kind=demonstrator) and fitting.demonstrations=1, or set it to pairs"
+        )
+
+
 def check_settings(fitting: FittingSettings, solved: bool, kind: str, candidates: int) -> None:
     """Raise `ConfigError` for what a fit would refuse, before anybody is asked.
 
@@ -94,8 +107,9 @@ def check_settings(fitting: FittingSettings, solved: bool, kind: str, candidates
 
 
 def check_solved(fitting: FittingSettings) -> None:
-    """Raise `ConfigError` for settings that change what is fitted from epoch to epoch, or from step to step."""
-    off = {"denoise": "off", "pseudo_labels": 0.0, "crop": 0.0}
+    """Raise `ConfigError` for settings that change what is fitted from epoch to epoch, or from step to step, or that
+    need a score with an offset of its own."""
+    off = {"denoise": "off", "pseudo_labels": 0.0, "crop": 0.0, "shown_as": "pairs"}
     if given := [f"fitting.{name}" for name, value in off.items() if getattr(fitting, name) != value]:
         raise ConfigError(
             f"{', '.join(given)}: this reward is solved for, not descended; leave them out, or use another reward.kind"

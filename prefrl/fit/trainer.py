@@ -45,16 +45,23 @@ def fit(
     if fitting.pseudo_labels:
         waiting: list[C] = [c for query in store.open_queries() for c in query.candidates]
         unjudged = list(unjudged) + waiting
-    shown = _implied(store.demonstrations(snapshot), fitting.demonstrations) if fitting.demonstrations else []
-    shown, judged = shown[-(fitting.newest or 0) :], store.judged(snapshot)[-(fitting.newest or 0) :]
+    shown = _implied(store.demonstrations(snapshot), fitting) if fitting.demonstrations else []
+    judged = store.judged(snapshot)[-(fitting.newest or 0) :]
     fitted = fit_judged(reward, [*judged, *shown], fitting, rng, unjudged, len(shown))
     fitted.metrics["snapshot"] = float(snapshot)
     return replace(fitted, metrics=fitted.metrics | {"shown": float(len(shown))}) if shown else fitted
 
 
-def _implied(demonstrations: Sequence[Demonstrated[C]], weight: float) -> list[Judged[C]]:
-    found = (one.implied(weight) for one in demonstrations)
-    return [one for one in found if one is not None]
+def _implied(demonstrations: Sequence[Demonstrated[C]], fitting: FittingSettings) -> list[Judged[C]]:
+    """What the newest demonstrations say, one after another; those that stand for themselves say nothing."""
+    weight = fitting.demonstrations
+    if fitting.shown_as == "piles":
+        each = [one.told_apart(weight) for one in demonstrations]
+    else:
+        pairs = (one.implied(weight) for one in demonstrations)
+        each = [[one] for one in pairs if one is not None]
+    each = [one for one in each if one][-(fitting.newest or 0) :]
+    return [one for some in each for one in some]
 
 
 def fit_judged(
@@ -122,7 +129,7 @@ def _problem(
         every=every,
         train=train,
         test=every.subset(out),
-        likelihood=Likelihood(reward.members, every, fitting.ties, fitting.error_rate, fitting.reliability),
+        likelihood=Likelihood(reward.members, every, fitting),
         weight=resampled,
         fitting=fitting,
     )

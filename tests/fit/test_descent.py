@@ -42,7 +42,7 @@ def problem(scores: Sequence[float], judged: Sequence[Judged[Segment]], **settin
         every=every,
         train=every,
         test=every.subset(torch.zeros(len(judged), dtype=torch.bool)),
-        likelihood=Likelihood(1, every, "half", 0.0, settings.get("reliability", "alike")),
+        likelihood=Likelihood(1, every, FittingSettings(**settings)),
         weight=torch.ones(1, len(judged)),
         fitting=FittingSettings(**settings),
     )

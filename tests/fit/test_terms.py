@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from prefrl.fit.likelihood import Likelihood, per_judgement, weights
+from prefrl.fit.settings import FittingSettings
 from prefrl.fit.terms import Terms, terms
 from prefrl.judgements import Choice, Comparison, Judged, Judgement, Ranking, Rating
 from prefrl.types import Query, Response
@@ -35,7 +36,7 @@ def loss(
     """The weighted negative log-likelihood of judgements."""
     settings = {"ties": "half", "rankings": "plackett_luce"} | ways
     made = terms(some, [c.id for c in pool], **settings)  # type: ignore[arg-type]
-    likelihood = Likelihood(1, made, settings["ties"], 0.0, "alike")  # type: ignore[arg-type]
+    likelihood = Likelihood(1, made, FittingSettings.model_validate(settings))
     values = likelihood.losses(made, torch.tensor([list(scores)])) * weights(made, torch.ones(1, len(some)))
     return float(values.detach().sum())
 
@@ -86,7 +87,7 @@ def test_rankings_with_ties_as_outcomes_have_probabilities_that_sum_to_one(rng: 
     some = [judged(pool, lambda id, r=ranks: Ranking(id, r)) for ranks in weak_orders(4)]  # type: ignore[misc]
     assert len(some) == 75
     made = terms(some, [c.id for c in pool], "davidson", "plackett_luce")
-    losses = Likelihood(1, made, "davidson", 0.0, "alike").losses(made, torch.tensor(scores).float()[None])
+    losses = Likelihood(1, made, FittingSettings(ties="davidson")).losses(made, torch.tensor(scores).float()[None])
     each = per_judgement(made, losses.detach())[0][0]
     assert float((-each).exp().sum()) == pytest.approx(1, rel=1e-5)
 

@@ -566,6 +566,9 @@ def test_only_the_newest_answers_count_where_that_is_said(
         assert (metrics["judgements"], metrics["shown"]) == (8, 4)
         every = fit(model(), store, FittingSettings(epochs=1), np.random.default_rng(0)).metrics
         assert (every["judgements"], every["shown"]) == (36, 6)
+        apart = FittingSettings(epochs=1, newest=4, shown_as="piles")
+        piles = fit(model(), store, apart, np.random.default_rng(0)).metrics
+        assert (piles["judgements"], piles["shown"]) == (4 + 2 * 4, 2 * 4)
 
 
 def test_a_fit_on_judgements_and_demonstrations_says_what_each_kind_had(
