@@ -350,6 +350,11 @@ class ControlLearner:
             self._imitation.check(shows)
 
     def check_ranks(self, count: int) -> None:
+        if self._imitation is not None:
+            raise ConfigError(
+                f"learner.clone learns from demonstrations, which the first of {count} ranks alone has: leave it "
+                "out, or start one rank"
+            )
         if self._settings.environments < count:
             raise ConfigError(
                 f"{count} ranks share the environments of a learner, and learner.environments is "

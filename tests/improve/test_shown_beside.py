@@ -211,3 +211,8 @@ def test_a_policy_that_cannot_be_cloned_here_is_refused(policy: dict[str, Any]) 
 def test_a_file_that_nothing_is_to_be_done_with_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"learner\.clone\.data: .* is of no use while epochs and keep are 0"):
         Config.load("control/pendulum", ["learner.clone.data=shown"])
+
+
+def test_ranks_that_know_no_demonstrations_are_refused() -> None:
+    with pytest.raises(ConfigError, match="demonstrations, which the first of 2 ranks alone has"):
+        learner({"keep": 0.1}).check_ranks(2)
