@@ -15,6 +15,7 @@ from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.tabular import GridworldSettings, table
 from prefrl.envs.toys import ToyTask
 from prefrl.improve.q_learning import QLearning, QLearningSettings
+from prefrl.policies.rollout import collect
 from prefrl.store import Store
 from prefrl.types import Floats, Segment
 
@@ -113,3 +114,15 @@ def _chosen(found: QLearning, observed: Floats) -> list[int]:
 def test_what_has_no_table_is_refused(task: Any, settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         learner(task, **settings)
+
+
+def test_one_pass_carries_a_reward_all_the_way_back() -> None:
+    grid = GridworldSettings(rows=("S..G",), slip=0, horizon=4, segment_steps=2)
+    task, right = grid.build(), np.eye(4, dtype=np.float32)[[1]]
+    found = learner(task, rate=1.0, passes=1)
+    envs = task.environments(1)
+    rollout, _ = collect(envs, envs.reset(np.random.default_rng(0)), 4, lambda *_: (right, right))
+    assert rollout.gold.tolist() == [[0, 0, 0, 1]]
+    errors = found._pass(rollout, rollout.gold)
+    np.testing.assert_allclose(errors[:, 0], [0.8**3, 0.8**2, 0.8, 1])
+    np.testing.assert_allclose(found.values[:, 1], [0.8**3, 0.8**2, 0.8, 1])
