@@ -50,6 +50,8 @@ def test_it_comes_to_the_best_policy_and_near_its_exact_values(store: Store[Segm
     assert off.max() < 0.25  # a constant rate never comes to rest
     metrics = found.evaluate(TRUE, np.random.default_rng(0)).metrics
     assert metrics["learned"] == pytest.approx(metrics["gold"])
+    at_random = exact.objective(MDP, np.full(policy.shape, 0.25), GRID.horizon)
+    assert metrics["gold"] > (at_random + exact.objective(MDP, policy, GRID.horizon)) / 2
 
 
 def test_without_chance_and_with_a_rate_of_one_the_values_are_exact(store: Store[Segment]) -> None:
