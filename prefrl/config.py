@@ -180,13 +180,17 @@ class Config(Settings):
         """Raises `ConfigError` where the labeler cannot answer about so many candidates, or nobody learns from it."""
         count = cast(SelectorSettings, self.select).candidates
         shows = _shows(labeler)
+        if self.loop.labels and isinstance(labeler, Demonstrates) and not labeler.corrects:
+            raise ConfigError(
+                f"loop.labels={self.loop.labels}, but the labeler ({self.labeler.model_dump()['kind']}) shows what it "
+                "has, and answers no question: set loop.labels=0, or choose another"
+            )
         if self.loop.labels and shows != (count == 1):
             says = "shows what to do in the states of one" if shows else "compares two or more"
             raise ConfigError(
                 f"select.candidates={count}, but the labeler ({self.labeler.model_dump()['kind']}) {says}: set "
                 f"{'select.kind=uniform select.candidates=1' if shows else 'select.candidates=2'}, or choose another"
             )
-
         if self.loop.labels and shows and not (isinstance(learner, Imitates) or self.fitting.demonstrations):
             raise ConfigError(
                 f"learner.kind={self.learner.model_dump()['kind']} learns nothing from demonstrations, and the labeler "

@@ -309,6 +309,10 @@ class Demonstrates(Protocol):
     @property
     def demonstrates(self) -> bool: ...
 
+    @property
+    def corrects(self) -> bool:
+        """Whether it answers about the learner's own; else it only shows what it has."""
+
 
 @runtime_checkable
 class Advises(Protocol):

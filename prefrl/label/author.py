@@ -52,6 +52,7 @@ class Author:
     settings: AuthorSettings
     task: Authored
     demonstrates: bool = True
+    corrects: bool = False
 
     @property
     def name(self) -> str:

@@ -71,6 +71,7 @@ class Demonstrator:
     expert: Expert | None = None
     """Who shows whole episodes first."""
     demonstrates: bool = True
+    corrects: bool = True
 
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Answer every open query with a random piece of the same length.

@@ -65,6 +65,7 @@ class Expert:
     moods: Moods | None = None
     """In its own episodes, where these are not all alike."""
     demonstrates: bool = True
+    corrects: bool = True
 
     @property
     def name(self) -> str:

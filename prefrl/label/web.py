@@ -174,6 +174,10 @@ class WebLabeler:
     def demonstrates(self) -> bool:
         return self.shows is not None
 
+    @property
+    def corrects(self) -> bool:
+        return True
+
     def open(self, store: Any, fixed: bool = False) -> list[str]:
         """Start the page; returns what people should know, the link first. Raises `ConfigError`."""
         self.fixed = fixed

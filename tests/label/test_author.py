@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.prompts import is_for_evaluation
 from prefrl.envs.text import Reviews
@@ -58,3 +59,13 @@ def test_questions_about_others_texts_and_tasks_without_a_writer_are_refused(
     silent = cast("Task", type("Silent", (), {"kind": "text", "name": "prompts"})())
     with pytest.raises(ConfigError, match="no writer of its own"):
         AuthorSettings().build(silent)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_questions_that_it_cannot_answer_are_refused_before_one_is_asked(tmp_path: Path, count: int) -> None:
+    asked = ["loop.labels=4", "select.kind=uniform", f"select.candidates={count}"]
+    with (
+        Store[Response](tmp_path) as store,
+        pytest.raises(ConfigError, match=r"\(author\) shows what it has, and answers no question: set loop\.labels=0"),
+    ):
+        Config.load("text/reviews-demos", asked).build(store)
