@@ -7,10 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from prefrl.kinds import only
+from prefrl.kinds import kind_of, only
+from prefrl.protocols import ControlTask
 from prefrl.storage.log import has_store
 from prefrl.store import Store
 from prefrl.types import Floats, Segment
+
+ROUNDING = 1e-4
+"""By how much an action may lie outside of its bounds: files hold them in few digits."""
 
 
 class Recording(NamedTuple):
@@ -49,6 +53,30 @@ def recording(path: Path) -> Recording:
     free = (np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32))
     discrete = size > 1 and all(_one_hot(one.actions) for one in found)
     return Recording(tuple(found), None if discrete else bounds or free)
+
+
+def recorded(path: Path, task: ControlTask) -> tuple[Segment, ...]:
+    """Behaviour of any length to be imitated. Raises `ValueError` where it cannot be."""
+    found = recording(path).segments
+    for one in found:
+        check_imitable(one, task)
+    return found
+
+
+def check_imitable(one: Segment, task: ControlTask) -> None:
+    """Raise `ValueError` where a behaviour cannot be imitated in a task."""
+    kind, bounds = kind_of(one), task.action_bounds
+    fault = kind.misfit(one, task) or kind.fault(one) or ("has no step" if not len(one) else "")
+    if not fault and bounds is None and not _one_hot(one.actions):
+        fault = "has actions that are not one-hot, and those of the task are discrete"
+    if not fault and bounds is not None:
+        low, high = (np.asarray(side) for side in bounds)
+        outside = (one.actions < low - ROUNDING) | (one.actions > high + ROUNDING)
+        if outside.any():
+            step = int(outside.any(1).argmax())
+            fault = f"has the action {one.actions[step]} in step {step}, outside of the bounds {low} to {high}"
+    if fault:
+        raise ValueError(f"the demonstration {one.episode!r} from step {one.start} {fault}: leave it out, or mend it")
 
 
 def _demonstrated(folder: Path) -> list[Segment]:

@@ -19,13 +19,13 @@ from torch import Tensor
 from typing_extensions import TypeVar
 
 from prefrl.components import ConfigError, Settings
-from prefrl.exchange.recordings import recording
+from prefrl.exchange.recordings import check_imitable, recorded, recording
 from prefrl.fit.pairs import Batch, batch
 from prefrl.fit.split import split
 from prefrl.improve.gradient import adam, descend_by_logp
 from prefrl.improve.pairs import measured, shuffled
 from prefrl.improve.player import NO_ZIP, Player
-from prefrl.improve.shown import Passes, Shown, check_shown, clone, recorded, steps_of
+from prefrl.improve.shown import Passes, Shown, clone, steps_of
 from prefrl.kinds import kind_of
 from prefrl.policies.acting import Acting, Actor, Clonable, Decisions, Memory
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
@@ -234,7 +234,7 @@ class Offline(Generic[P]):
             return {}
         if new := segments[self._seen :]:
             for one in new if self._settings.imitates else ():
-                check_shown(one, self._task)
+                check_imitable(one, self._task)
             self.policy.observe(np.concatenate([one.observations for one in new]))
         self._seen = len(segments)
         settings = self._settings

@@ -19,18 +19,15 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from prefrl.components import ConfigError, Settings
-from prefrl.exchange.recordings import recording
+from prefrl.exchange.recordings import check_imitable, recorded
 from prefrl.improve.gradient import Batch, Beside, Optimizer, adam, update
 from prefrl.improve.objectives import Objective
 from prefrl.improve.pairs import shuffled
-from prefrl.kinds import kind_of
 from prefrl.policies.acting import Clonable, Decisions
 from prefrl.policies.mlp import MLPPolicy
 from prefrl.protocols import ControlTask, I, Store
 from prefrl.types import Metrics, Segment
 
-ROUNDING = 1e-4
-"""By how much an action may lie outside of its bounds: files hold them in few digits."""
 LONGEST = 1.0
 """A gradient of cloning that is longer is shortened to this."""
 NOTHING = (
@@ -125,7 +122,7 @@ class Imitation:
         if not segments:
             raise ValueError(f"learner.clone {NOTHING}")
         for one in segments:
-            check_shown(one, self._task)
+            check_imitable(one, self._task)
         return Shown(segments, {one.like.id: one.demonstration.weight for one in demonstrations})
 
     def first(self, policy: MLPPolicy, shown: Shown) -> Metrics:
@@ -200,27 +197,3 @@ def once(segments: Sequence[Segment]) -> list[Segment]:
             kept.add(number)
             known |= steps
     return [one for number, one in enumerate(segments) if number in kept]
-
-
-def recorded(path: Path, task: ControlTask) -> tuple[Segment, ...]:
-    """Behaviour of any length to be cloned. Raises ValueError where it cannot be."""
-    found = recording(path).segments
-    for one in found:
-        check_shown(one, task)
-    return found
-
-
-def check_shown(one: Segment, task: ControlTask) -> None:
-    """Raise `ValueError` where a behaviour cannot be cloned."""
-    kind, bounds = kind_of(one), task.action_bounds
-    fault = kind.misfit(one, task) or kind.fault(one) or ("has no step" if not len(one) else "")
-    if not fault and bounds is None and not (np.isin(one.actions, (0, 1)) & (one.actions.sum(1) == 1)[:, None]).all():
-        fault = "has actions that are not one-hot, and those of the task are discrete"
-    if not fault and bounds is not None:
-        low, high = (np.asarray(side) for side in bounds)
-        outside = (one.actions < low - ROUNDING) | (one.actions > high + ROUNDING)
-        if outside.any():
-            step = int(outside.any(1).argmax())
-            fault = f"has the action {one.actions[step]} in step {step}, outside of the bounds {low} to {high}"
-    if fault:
-        raise ValueError(f"the demonstration {one.episode!r} from step {one.start} {fault}: leave it out, or mend it")

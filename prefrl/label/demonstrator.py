@@ -17,9 +17,8 @@ import numpy as np
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
-from prefrl.exchange.recordings import recording
+from prefrl.exchange.recordings import recorded
 from prefrl.judgements import Demonstration
-from prefrl.kinds import kind_of
 from prefrl.label.expert import Expert, ExpertSettings
 from prefrl.protocols import ControlTask, Store, Task, control
 from prefrl.sample.segments import piece, placed
@@ -48,12 +47,9 @@ class DemonstratorSettings(Settings):
 def shown(path: Path, task: ControlTask) -> Sequence[Segment]:
     """The recorded demonstrations. Raises `ConfigError` where they do not fit the task."""
     try:
-        segments = recording(path).segments
+        segments = recorded(path, task)
     except ValueError as error:
         raise ConfigError(f"labeler.data: {error}") from error
-    for one in segments:
-        if fault := kind_of(one).misfit(one, task) or kind_of(one).fault(one):
-            raise ConfigError(f"labeler.data: the demonstration {one.episode!r} of {path} {fault}: choose another one")
     if max(map(len, segments)) < task.segment_steps:
         raise ConfigError(
             f"labeler.data: no demonstration of {path} has task.segment_steps={task.segment_steps} steps: make them "

@@ -266,7 +266,9 @@ def test_demonstrations_that_are_too_short_or_of_other_sizes_are_refused(pendulu
     with pytest.raises(ConfigError, match=r"labeler\.data: no demonstration of .* has task\.segment_steps=5 steps"):
         DemonstratorSettings(data=recorded(tmp_path / "short", steps=4)).build(pendulum)
     cartpole = cast("ControlTask", ControlSettings.model_validate({"env": "CartPole-v1"}).build())
-    with pytest.raises(ConfigError, match=r"labeler\.data: the demonstration 'shown 0' of .* but CartPole-v1 has"):
+    with pytest.raises(ConfigError, match=r"labeler\.data: the demonstration 'shown 0' .* but CartPole-v1 has"):
         DemonstratorSettings(data=recorded(tmp_path / "other")).build(cartpole)
+    with pytest.raises(ConfigError, match=r"labeler\.data: the demonstration 'shown 3' .* outside of the bounds"):
+        DemonstratorSettings(data=recorded(tmp_path / "far", count=4)).build(pendulum)
     with pytest.raises(ConfigError, match=r"labeler\.data: .*expected an \.npz"):
         DemonstratorSettings(data=tmp_path / "nothing").build(pendulum)
