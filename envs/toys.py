@@ -18,7 +18,7 @@ REACH = 1.5
 TURNS = ("on", "left", "right")
 DISC, GOAL, GOAL_SIZE = 0.6, np.array([0.0, 1.0]), 0.15
 """Of the fork: the radius of what stands in the middle, and where to go."""
-INK, MARK = (34, 87, 150), (214, 116, 30)
+INK, MARK, GREY = (34, 87, 150), (214, 116, 30), (150, 150, 150)
 
 
 class Drawn(Dynamics, Protocol):
@@ -46,12 +46,7 @@ class Point:
 
     def picture(self, state: Floats, size: int) -> np.ndarray:
         """The point in blue, the middle in orange."""
-        axis = np.linspace(-REACH, REACH, size)
-        grid = np.stack(np.meshgrid(axis, -axis), -1)
-        picture = np.full((size, size, 3), 246, np.uint8)
-        picture[np.linalg.norm(grid, axis=-1) < 0.08] = MARK
-        picture[np.linalg.norm(grid - state, axis=-1) < 0.13] = INK
-        return picture
+        return _dots(size, (np.zeros(2), 0.08, MARK), (state, 0.13, INK))
 
 
 @dataclass(frozen=True)
@@ -142,12 +137,7 @@ class Fork:
 
     def picture(self, state: Floats, size: int) -> np.ndarray:
         """The disc in grey, the goal in orange, the point in blue."""
-        axis = np.linspace(-REACH, REACH, size)
-        grid = np.stack(np.meshgrid(axis, -axis), -1)
-        picture = np.full((size, size, 3), 246, np.uint8)
-        for middle, radius, ink in ((np.zeros(2), DISC, 150), (GOAL, GOAL_SIZE, MARK), (state[:2], 0.08, INK)):
-            picture[np.linalg.norm(grid - middle, axis=-1) < radius] = ink
-        return picture
+        return _dots(size, (np.zeros(2), DISC, GREY), (GOAL, GOAL_SIZE, MARK), (state[:2], 0.08, INK))
 
 
 class ForkSettings(Settings):
@@ -167,6 +157,16 @@ class ForkSettings(Settings):
         bounds = -np.ones(2, np.float32), np.ones(2, np.float32)
         parts = "fork", Fork(self.side), self.horizon, self.segment_steps or self.horizon, self.frame_size
         return ToyTask(*parts, action_size=2, fps=10.0, action_bounds=bounds)
+
+
+def _dots(size: int, *dots: tuple[Floats, float, tuple[int, int, int]]) -> np.ndarray:
+    """A picture of the plane with discs on it: middle, radius and colour of each, the last one on top."""
+    axis = np.linspace(-REACH, REACH, size)
+    plane = np.stack(np.meshgrid(axis, -axis), -1)
+    picture = np.full((size, size, 3), 246, np.uint8)
+    for middle, radius, ink in dots:
+        picture[np.linalg.norm(plane - middle, axis=-1) < radius] = ink
+    return picture
 
 
 class TMazeSettings(Settings):

@@ -30,7 +30,7 @@ from prefrl.improve.valued import Turn, valued
 from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, forgotten
 from prefrl.policies.cnn import CNNPolicySettings
 from prefrl.policies.divided import environments, of_all
-from prefrl.policies.flow import FlowPolicy, FlowPolicySettings
+from prefrl.policies.flow import NEITHER, FlowPolicy, FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
@@ -48,8 +48,6 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 """Where their defaults are others than those of the fields below."""
 ITS_OWN = {"hidden", "initial_std", "squash", "sde", "sde_steps"}
 """Settings of a policy that starts from another one, and that may be the other's."""
-OF_FLOWS: dict[str, Any] = {"entropy": 0.0, "target_kl": None}
-"""What a flow gives neither: settings that may not be others there, and need not be named."""
 MOVED = ("hidden", "initial_std")
 """Settings that were the learner's own once, and are its policy's."""
 SLOWER = 0.3
@@ -132,7 +130,7 @@ class ControlLearnerSettings(Settings):
         if moved:
             raise ValueError("\n".join(f".{name}: this is now learner.policy.{name}; write it there" for name in moved))
         found = filled_in(given, ALGORITHMS)
-        return OF_FLOWS | found if isinstance(found, dict) and _flows(found.get("policy")) else found
+        return NEITHER | found if isinstance(found, dict) and _flows(found.get("policy")) else found
 
     @classmethod
     def renamed(cls, saved: dict[str, Any]) -> dict[str, Any]:
@@ -162,19 +160,8 @@ class ControlLearnerSettings(Settings):
 
     @model_validator(mode="after")
     def _of_flows(self) -> ControlLearnerSettings:
-        if not isinstance(self.policy, FlowPolicySettings):
-            return self
-        for name, value in OF_FLOWS.items():
-            if (came := getattr(self, name)) != value:
-                raise ValueError(
-                    f".{name}: expected {'null' if value is None else value} with policy.kind=flow, got {came}: a flow "
-                    "has no density that is known, and so neither an entropy nor a KL: set it so"
-                )
-        if min(self.rollout_lengths()) < self.policy.execute:
-            raise ValueError(
-                f".rollout_steps: a rollout has {min(self.rollout_lengths())} steps, and a plan of "
-                f"{self.policy.execute} does not end in it: raise it, or steps_per_round"
-            )
+        if isinstance(self.policy, FlowPolicySettings):
+            self.policy.check(self.entropy, self.target_kl, min(self.rollout_lengths()))
         return self
 
     @model_validator(mode="after")

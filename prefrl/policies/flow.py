@@ -31,6 +31,8 @@ from prefrl.protocols import ControlTask
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, Segment, State
 
+NEITHER: dict[str, float | None] = {"entropy": 0.0, "target_kl": None}
+"""What a flow gives neither: settings of a learner that may not be others there, and need not be named."""
 WAVES = math.pi * np.arange(1, 5, dtype=np.float32)
 """Of the cosines by which the network is told the time, from 0 (noise) to 1 (a plan)."""
 SEEDS = 2**24
@@ -62,6 +64,20 @@ class FlowPolicySettings(Settings):
         if self.execute > self.chunk:
             raise ValueError(f"execute must be at most chunk, got {self.execute} of {self.chunk} planned actions")
         return self
+
+    def check(self, entropy: float, target_kl: float | None, shortest: int) -> None:
+        """Raise `ValueError` where a learner wants what a flow has not, or its rollouts are shorter than a plan."""
+        for name, came, only in (("entropy", entropy, "0"), ("target_kl", target_kl, "null")):
+            if came != NEITHER[name]:
+                raise ValueError(
+                    f".{name}: expected {only} with policy.kind=flow, got {came}: a flow has no density that is known, "
+                    "and so neither an entropy nor a KL: set it so"
+                )
+        if shortest < self.execute:
+            raise ValueError(
+                f".rollout_steps: a rollout has {shortest} steps, and a plan of {self.execute} does not end in it: "
+                "raise it, or steps_per_round"
+            )
 
     def build(self, task: ControlTask, rng: np.random.Generator) -> FlowPolicy:
         """Raises `ConfigError` where actions are discrete."""

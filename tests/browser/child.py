@@ -6,8 +6,9 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from playwright.sync_api import Page
 
@@ -47,6 +48,10 @@ class Child:
     def kill(self) -> None:
         self.process.kill()
         self.process.wait(10)
+
+
+Start: TypeAlias = Callable[..., Child]
+"""A command, word by word -> what runs it."""
 
 
 def serve_command(folder: Path, port: int, overrides: Sequence[str] = ()) -> list[str]:

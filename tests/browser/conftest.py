@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browser.child import Child, Start
 from browser.house import House, Open, clips, copy, fill, serving, texts
 from browser.visitor import Visit, Visitor, enter
 from playwright.sync_api import Browser, expect, sync_playwright
@@ -99,3 +100,17 @@ def _draw(made: Clips, ids: list[str]) -> None:
 
     for id in ids:
         asyncio.run(made.get(made.names(id)[0].removeprefix("/media/"), 90.0))
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start a command; what still runs in the end is killed."""
+    children: list[Child] = []
+
+    def begin(*command: str) -> Child:
+        children.append(Child(*command, log=tmp_path / f"log-{len(children)}"))
+        return children[-1]
+
+    yield begin
+    for child in children:
+        child.kill()

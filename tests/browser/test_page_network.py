@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from browser.child import Child, free_port, serve_command
+from browser.child import Start, free_port, serve_command
 from browser.house import House, clips, fill
 from browser.visitor import LOST, Visit, Visitor
 from playwright.sync_api import APIResponse, Browser, Route, expect
@@ -15,27 +14,12 @@ from prefrl.store import Store
 from prefrl.types import Segment
 
 pytestmark = pytest.mark.browser
-Start = Callable[..., Child]
 FOLLOW = """() => {
   window.states = [];
   const button = document.querySelector("[data-testid=save-state]");
   const note = () => window.states.push(button.dataset.state);
   new MutationObserver(note).observe(button, { attributes: true, attributeFilter: ["data-state"] });
 }"""
-
-
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
-    """Start a command; what still runs in the end is killed."""
-    children: list[Child] = []
-
-    def begin(*command: str) -> Child:
-        children.append(Child(*command, log=tmp_path / f"log-{len(children)}"))
-        return children[-1]
-
-    yield begin
-    for child in children:
-        child.kill()
 
 
 def states(visitor: Visitor) -> list[str]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browser.child import Child, free_port, serve_command
+from browser.child import Start, free_port, serve_command
 from browser.house import CONFIG, POINT, STEPS, House, Open, fill, segment
 from browser.visitor import LOST, Visit, Visitor
 from playwright.sync_api import Browser, expect
@@ -40,20 +40,6 @@ def singles(drawn: Path) -> Make:
     return make
 
 
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
-    """Start a command; what still runs in the end is killed."""
-    children: list[Child] = []
-
-    def begin(*command: str) -> Child:
-        children.append(Child(*command, log=tmp_path / f"log-{len(children)}"))
-        return children[-1]
-
-    yield begin
-    for child in children:
-        child.kill()
-
-
 def keys(visitor: Visitor, *names: str) -> None:
     for name in names:
         visitor.page.keyboard.press(name)
@@ -73,7 +59,7 @@ def meant(turn: int) -> Any:
 
 
 def test_of_40_corrections_by_keys_none_is_lost_as_the_server_is_killed_and_they_are_cloned(
-    tmp_path: Path, singles: Make, chromium: Browser, visit: Visit, start: Callable[..., Child]
+    tmp_path: Path, singles: Make, chromium: Browser, visit: Visit, start: Start
 ) -> None:
     folder, port = singles(tmp_path / "clips", CORRECTIONS), free_port()
     server = start(*serve_command(folder, port, ACTION))
