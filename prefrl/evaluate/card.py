@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from prefrl.stats.estimates import Estimate, Number, Part, Words
 
+P = TypeVar("P", bound=Part)
 Points = Annotated[list[Number], Field(max_length=1000)]
 
 
@@ -262,3 +264,11 @@ class Exact(Part):
         if any(not 0 <= j < len(self.rows[i]) for i, j in self.cells):
             raise ValueError("expected cells within their rows")
         return self
+
+
+def read_part(kind: type[P], path: Path) -> P | None:
+    """What a file holds; None where there is none, or it cannot be read as that."""
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except (ValidationError, OSError):
+        return None

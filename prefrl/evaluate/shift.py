@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from pydantic import ValidationError
 
-from prefrl.evaluate.card import Mistakes, Shift
+from prefrl.evaluate.card import Mistakes, Shift, read_part
 from prefrl.policies.rollout import Rollout, collect
 from prefrl.protocols import Acts, ControlTask
 from prefrl.storage.files import write_file
@@ -97,15 +96,7 @@ def _blocks(whole: Floats, going: Bools, width: int) -> tuple[list[Floats], list
 
 def keep_mistakes(folder: Path, found: Mistakes, episodes: int, horizon: int) -> None:
     """Write a round into the file of a run's folder; what is there of it, or of later ones, is replaced."""
-    before = read_shift(folder)
+    before = read_part(Shift, folder / FILE)
     rounds = [one for one in (before.rounds if before else ()) if one.round < found.round]
     shift = Shift(episodes=episodes, every=every(horizon), rounds=(*rounds, found))
     write_file(folder / FILE, shift.model_dump_json().encode())
-
-
-def read_shift(folder: Path) -> Shift | None:
-    """What was measured so far; None where nothing was, or it cannot be read."""
-    try:
-        return Shift.model_validate_json((folder / FILE).read_bytes())
-    except (ValidationError, OSError):
-        return None

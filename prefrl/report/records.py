@@ -15,10 +15,9 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import ValidationError
 
 from prefrl.evaluate.calibration import reliability
-from prefrl.evaluate.card import Bin, Exact, Hindsight, ReportCard, Shift
+from prefrl.evaluate.card import Bin, Exact, Hindsight, ReportCard, Shift, read_part
 from prefrl.stats.estimates import Part
 from prefrl.types import Json
 
@@ -237,13 +236,10 @@ def _reliability(held_out: Json, missing: list[str]) -> tuple[Bin, ...]:
 
 def _part(cls: type[P], path: Path, missing: list[str]) -> P | None:
     """What a file holds, where there is one."""
-    if not path.is_file():
-        return None
-    try:
-        return cls.model_validate_json(path.read_bytes())
-    except (ValidationError, OSError):
+    found = read_part(cls, path)
+    if found is None and path.is_file():
         missing.append(f"{path.name}: cannot be read")
-        return None
+    return found
 
 
 def _examples(path: Path, missing: list[str]) -> tuple[Example, ...]:

@@ -14,8 +14,8 @@ import pytest
 from prefrl.config import Config
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.experts import EXPERTS
-from prefrl.evaluate.card import Mistakes
-from prefrl.evaluate.shift import Yardstick, errors, every, keep_mistakes, read_shift
+from prefrl.evaluate.card import Mistakes, Shift, read_part
+from prefrl.evaluate.shift import FILE, Yardstick, errors, every, keep_mistakes
 from prefrl.policies.acting import Actor
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import Acts, ControlTask
@@ -81,12 +81,12 @@ def test_an_expert_beside_itself_makes_no_mistake() -> None:
 def test_a_round_that_is_done_again_takes_the_place_of_itself_and_of_later_ones(tmp_path: Path) -> None:
     for number, eps in ((0, 0.5), (1, 0.4), (2, 0.3), (1, 0.2)):
         keep_mistakes(tmp_path, Mistakes(round=number, eps=eps, error=[eps], running=[1.0]), 3, 2500)
-    shift = read_shift(tmp_path)
+    shift = read_part(Shift, tmp_path / FILE)
     assert shift is not None
     assert [(one.round, one.eps) for one in shift.rounds] == [(0, 0.5), (1, 0.2)]
     assert (shift.episodes, shift.every, every(1000)) == (3, 3, 1)
     (tmp_path / "shift.json").write_text("{")
-    assert read_shift(tmp_path) is None
+    assert read_part(Shift, tmp_path / FILE) is None
 
 
 def test_a_run_with_an_expert_measures_mistakes_and_fits_on_demonstrations_alone(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_run_with_an_expert_measures_mistakes_and_fits_on_demonstrations_alone
     with Run(config, tmp_path / "run") as run:
         rounds = list(run)
         run.report()
-    shift = read_shift(tmp_path / "run")
+    shift = read_part(Shift, tmp_path / "run" / FILE)
     assert shift is not None
     assert [(one.round, len(one.error)) for one in shift.rounds] == [(0, 20), (1, 20), (2, 20)]
     assert shift.rounds[0].eps != shift.rounds[1].eps
