@@ -100,12 +100,42 @@ def leave(folder: Path, task: Any, rows: Any, order: Any) -> None:
     (folder / "batches.json").write_text(json.dumps(batches))
 
 
+def peers_settings(folder: Path, steps: int) -> Any:
+    """Those of `clone`, by TRL's names."""
+    import torch
+    from trl import SFTConfig
+
+    return SFTConfig(
+        output_dir=str(folder / "peer"),
+        per_device_train_batch_size=MINIBATCH,
+        max_steps=steps,
+        learning_rate=RATE,
+        lr_scheduler_type="constant",
+        optim="adamw_torch",
+        adam_epsilon=1e-5,
+        weight_decay=0.0,
+        max_grad_norm=1.0,
+        completion_only_loss=True,
+        bf16=False,
+        use_cpu=True,
+        gradient_checkpointing=False,
+        max_length=None,
+        save_strategy="no",
+        logging_strategy="no",
+        report_to="none",
+        disable_tqdm=True,
+        model_init_kwargs={"dtype": torch.float32},
+        dataset_kwargs={"skip_prepare_dataset": True},
+        remove_unused_columns=False,
+    )
+
+
 def peer(folder: Path) -> None:
     """TRL's side, in its own environment."""
     import torch
     from datasets import Dataset
     from transformers import PreTrainedTokenizerFast, TrainerCallback
-    from trl import SFTConfig, SFTTrainer
+    from trl import SFTTrainer
 
     torch.set_num_threads(1)
     batches = json.loads((folder / "batches.json").read_text())
@@ -130,35 +160,12 @@ def peer(folder: Path) -> None:
         def on_train_begin(self, *_: Any, **__: Any) -> None:
             clock["begin"] = time.process_time()
 
-    config = SFTConfig(
-        output_dir=str(folder / "peer"),
-        per_device_train_batch_size=MINIBATCH,
-        max_steps=len(batches),
-        learning_rate=RATE,
-        lr_scheduler_type="constant",
-        optim="adamw_torch",
-        adam_epsilon=1e-5,
-        weight_decay=0.0,
-        max_grad_norm=1.0,
-        completion_only_loss=True,
-        bf16=False,
-        use_cpu=True,
-        gradient_checkpointing=False,
-        max_length=None,
-        save_strategy="no",
-        logging_strategy="no",
-        report_to="none",
-        disable_tqdm=True,
-        model_init_kwargs={"dtype": torch.float32},
-        dataset_kwargs={"skip_prepare_dataset": True},
-        remove_unused_columns=False,
-    )
     file = str(folder / "start" / "tokenizer.json")  # its settings are of another version of transformers
     special = json.loads((folder / "special.json").read_text())
     tokenizer = PreTrainedTokenizerFast(tokenizer_file=file, **special)
     trainer = InOrder(
         str(folder / "start"),
-        config,
+        peers_settings(folder, len(batches)),
         train_dataset=Dataset.from_dict(columns),
         processing_class=tokenizer,
         callbacks=[Clock()],
