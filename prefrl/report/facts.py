@@ -48,6 +48,8 @@ class Facts:
     """Whether the reward is one that the run began with, and never fitted."""
     fluency: tuple[float | None, float | None]
     reward_accuracy: float | None
+    held_out: Estimate | None
+    """The newest reward's accuracy on what its fit left out; None where nothing was graded."""
     kl: float | None
     drifted: Drifted | None
     shown: int | None
@@ -108,6 +110,7 @@ def gather(record: Record) -> Facts:
             first("fluency_after", fluency[-1] if fluency else None),
         ),
         reward_accuracy=first("reward_accuracy", last("fit/accuracy_held_out")),
+        held_out=record.card.accuracy if record.card and record.card.about.held_out else None,
         kl=first("kl", last("evaluate/kl")),
         drifted=_drifted(record),
         shown=None if _has_fitted(record) else whole(last("improve/demonstrations")),

@@ -64,6 +64,17 @@ def _wins(facts: Facts) -> list[str]:
     ]
 
 
+def _doubts(facts: Facts) -> list[str]:
+    """That the reward may know nothing yet, and what to do about it, in a sentence or none."""
+    known = facts.held_out
+    if known is None or known.value is None or known.low is None or known.low > 0.5:
+        return []
+    return [
+        f"On {show_count(known.count, 'held-out comparison')} the reward is not clearly better than a coin "
+        f"({show_share(known.value)} right): more labels tell, and so does how often two labelers agree."
+    ]
+
+
 def _noise(facts: Facts, change: float) -> str:
     """What to say of a change of gold that may be chance; "" where it may not, or nobody can tell."""
     spreads = [value for value in facts.gold_spread if value is not None]
@@ -77,7 +88,7 @@ def _noise(facts: Facts, change: float) -> str:
 
 
 def verdict(facts: Facts) -> str:
-    """What to think of it: worse, within the spread, past its best, less fluent."""
+    """What to think of it: worse, within the spread, past its best, by a reward that may know nothing, less fluent."""
     before, after, best = facts.gold
     remarks = []
     if before is not None and after is not None:
@@ -89,7 +100,7 @@ def verdict(facts: Facts) -> str:
             remarks.append(f"Its best round reached {show_number(best)}: it has been better than it ended.")
     if facts.shown is not None:
         remarks.append(f"It learned from {show_count(facts.shown, 'demonstration')}; nothing was compared.")
-    remarks += _wins(facts)
+    remarks += _wins(facts) + _doubts(facts)
     if facts.drifted is not None:
         since, near, far = facts.drifted
         remarks.append(

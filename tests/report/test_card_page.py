@@ -14,9 +14,11 @@ from prefrl.evaluate.card import Bucket, ReportCard
 from prefrl.evaluate.grade import Subject, grade
 from prefrl.judgements import Comparison, Judged
 from prefrl.report.card_words import groups, headline, span
+from prefrl.report.facts import gather
 from prefrl.report.records import read
 from prefrl.report.report import render_card, write_report
-from prefrl.stats.estimates import undefined
+from prefrl.report.words import verdict
+from prefrl.stats.estimates import Estimate, undefined
 from prefrl.types import Query, Response
 
 
@@ -89,6 +91,21 @@ def test_the_report_of_a_run_tells_of_the_card_that_lies_in_its_folder(card: Rep
     assert "How good is the reward model?" in page
     assert "<script" not in page
     assert "Accuracy by margin" in page
+
+
+@pytest.mark.parametrize(
+    ("low", "held_out", "warned"), [(0.31, True, True), (0.5, True, True), (0.51, True, False), (0.31, False, False)]
+)
+def test_a_reward_that_may_be_a_coin_is_said_to_be_one(
+    low: float, held_out: bool, warned: bool, card: ReportCard, tmp_path: Path
+) -> None:
+    about = card.about.model_copy(update={"held_out": held_out})
+    accuracy = Estimate(value=0.6, low=low, high=0.8, count=20)
+    (tmp_path / "card.json").write_text(
+        card.model_copy(update={"about": about, "accuracy": accuracy}).model_dump_json()
+    )
+    told = "On 20 held-out comparisons the reward is not clearly better than a coin (60\N{NO-BREAK SPACE}% right)"
+    assert (told in verdict(gather(read(tmp_path)))) is warned
 
 
 @pytest.mark.parametrize("wild", [None, "x", -1e308, 10**400, [1], {"value": "NaN"}, {"value": 1e300}])
