@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from runs import copied, exit_code, finish, tiny
 
@@ -225,6 +226,19 @@ def test_a_run_against_a_saved_reward_keeps_it_and_starts_from_it_whenever(
     other = with_reward(tiny("control/toy", "task.horizon=30"), first)
     with pytest.raises(RunError, match=r"another task \(task\.horizon is 40 there, 30 here\)"):
         Run(other, tmp_path / "other", first)
+
+
+def test_only_how_members_are_put_together_can_be_chosen_for_a_reward_that_is_fitted(
+    finished_tiny: dict[str, Path], tmp_path: Path
+) -> None:
+    config, fitted = tiny("control/toy", "loop.rounds=1"), finished_tiny["control/toy"]
+    cautious = with_reward(config, fitted, ["reward.combine.by=lower", "reward.combine.caution=2", "learner.gamma=0.9"])
+    with Run(config=cautious, folder=tmp_path / "policy", reward=fitted) as run:
+        segments = run.loop.learner.sample(4, np.random.default_rng(0))
+        members = run.loop.reward.member_scores(segments)
+        assert (run.loop.reward.score(segments) < members.mean(0)).all()
+    with pytest.raises(ConfigError, match=r"reward\.members: .* was fitted with 3, and 4 needs a fit of its own"):
+        with_reward(config, fitted, ["reward.members=4"])
 
 
 def test_a_kept_reward_that_was_changed_is_refused(tmp_path: Path) -> None:

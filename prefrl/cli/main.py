@@ -243,7 +243,7 @@ def improve(
 
     with on(ranks) as here:
         if here:
-            drive(Run(stages.with_reward(_load(source, overrides), reward), out, reward))
+            drive(Run(stages.with_reward(_load(source, overrides), reward, overrides or ()), out, reward))
 
 
 @app.command()

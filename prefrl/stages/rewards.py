@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
-from prefrl.components import ConfigError
+from prefrl.components import ConfigError, flat
 from prefrl.config import Config
 from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.grade import Subject, grade, of_judgements, of_run
@@ -58,17 +59,32 @@ def fit_reward(config: Config, source: Path, out: Path, which: Which | None = No
     return fitted, notes
 
 
-def with_reward(config: Config, saved: Path) -> Config:
+def with_reward(config: Config, saved: Path, overrides: Sequence[str] = ()) -> Config:
     """Settings that improve a policy against a saved reward model, and ask nobody.
 
     What they do not say of the task is as it was when the reward model was fitted: its model and its tokenizer, say.
+    `overrides`, as on a command line: those of the reward say how its members are put together. Raises `ConfigError`
+    for one that would need another fit.
     """
-    fitted = open_saved(saved).config
-    update: Json = {"reward": fitted.reward, "loop": config.loop.model_copy(update={"labels": 0})}
+    folder, fitted = open_saved(saved).folder, open_saved(saved).config
+    said = [one for one in overrides if one.startswith("reward.")]
+    reward = Config.reopen(folder / "config.yaml", said).reward
+    _check_only_combined(dict(flat(fitted.reward.model_dump())), dict(flat(reward.model_dump())), saved)
+    update: Json = {"reward": reward, "loop": config.loop.model_copy(update={"labels": 0})}
     if type(fitted.task) is type(config.task):
         said = {name: getattr(config.task, name) for name in config.task.model_fields_set}
         update["task"] = fitted.task.model_copy(update=said)
     return config.model_copy(update=update)
+
+
+def _check_only_combined(there: Json, here: Json, saved: Path) -> None:
+    """Raise `ConfigError` where settings of a fitted reward differ in more than how its members are put together."""
+    for key in [*there, *here]:
+        if there.get(key) != here.get(key) and not key.startswith("combine."):
+            raise ConfigError(
+                f"reward.{key}: {saved} was fitted with {there.get(key)}, and {here.get(key)} needs a fit of its own: "
+                "only reward.combine can be chosen anew"
+            )
 
 
 def report_card(
