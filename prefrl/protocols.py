@@ -58,6 +58,7 @@ class Noted(Protocol):
         """Whole sentences, such as how many prompts were left out."""
 
 
+@runtime_checkable
 class DrawnTask(Task, Protocol[C_contra]):
     """A task whose candidates are shown as clips."""
 

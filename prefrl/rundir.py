@@ -131,7 +131,7 @@ class Run:
     @property
     def summary(self) -> Json:
         """What came out, as in `summary.json`."""
-        return summarise(self._rows, self.loop.task, self.config.seed, self._origin)
+        return summarise(self._rows, self.loop.task, self.config.seed, self._origin, self.store.attention())
 
     def report(self) -> Path:
         """Grade the reward model where judgements were held out, score all rounds by it, and write `report.html`."""

@@ -292,6 +292,13 @@ class Store(Generic[C]):
         total, answered, skipped = (int(n or 0) for n in numbers)
         return total, answered, skipped
 
+    def attention(self) -> float:
+        """Seconds that people took to answer, checks and repetitions included, as far as a page timed them."""
+        timed = sql.select(event.c.body).where(event.c.body.cast(sql.Text).contains('"decision_ms":'))
+        with self.log.reading() as connection:
+            abouts = [body.get("about") or {} for body in connection.scalars(timed)]
+        return sum((about.get("timings") or {}).get("decision_ms") or 0.0 for about in abouts) / 1000
+
     def asked_before(self, ids: Sequence[str], sequence: int) -> set[str]:
         """Which of these queries and candidates had been asked about by then."""
         found: set[str] = set()

@@ -21,7 +21,7 @@ TOYS = ["control/toy", "text/toy"]
 SUMMARY = {
     "task", "kind", "seed", "rounds", "gold_before", "gold_after", "gold_best", "labels", "steps", "reward_accuracy",
     "kl", "fluency_before", "fluency_after", "seconds", "versions",
-    "source", "overrides", "made_with",
+    "source", "overrides", "made_with", "steps_per_second", "people_seconds",
 }  # fmt: skip
 
 

@@ -444,10 +444,12 @@ def _load(source: str, overrides: list[str] | None) -> Config:
 
 def _dry_run(config: Config, seeds: int) -> None:
     from prefrl.cli.console import duration, say
+    from prefrl.report.costs import account, costs
     from prefrl.stages import estimate
 
-    seconds, whole = estimate(config), "the whole" if seeds == 1 else "each of the runs"
-    say(f"everything builds and one small round runs; {whole} would take about {duration(seconds)}")
+    spent, whole = estimate(config), "the whole" if seeds == 1 else "each of the runs"
+    say(f"everything builds and one small round runs; {whole} would take about {duration(spent.machine)}")
+    say(f"what it would cost outside a simulator. {account(costs(spent))}")
 
 
 def main() -> None:

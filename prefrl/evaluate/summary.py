@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from prefrl.protocols import Task
+from prefrl.protocols import DrawnTask, Task
 from prefrl.types import Json
 
 STAGES = ("sample", "label", "fit", "improve", "evaluate")
@@ -48,8 +48,11 @@ def read_metrics(folder: Path) -> list[Json]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def summarise(rows: list[Json], task: Task, seed: int, origin: Origin) -> Json:
-    """One flat account of a run from its metrics; None where something was not measured."""
+def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: float = 0.0) -> Json:
+    """One flat account of a run from its metrics; None where something was not measured.
+
+    `people`: seconds that they took for their answers, if a page measured it.
+    """
     first, last = (rows[0], rows[-1]) if rows else ({}, {})
     gold = [row["evaluate/gold"] for row in rows if row.get("evaluate/gold") is not None]
     seconds = {stage: sum(row.get(f"seconds/{stage}") or 0.0 for row in rows) for stage in STAGES}
@@ -69,6 +72,8 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin) -> Json:
         "kl": last.get("evaluate/kl"),
         "fluency_before": first.get("evaluate/fluency"),
         "fluency_after": last.get("evaluate/fluency"),
+        "steps_per_second": task.fps if isinstance(task, DrawnTask) else None,
+        "people_seconds": people or None,
         "seconds": seconds | {"total": sum(seconds.values())},
         "source": origin.source,
         "overrides": list(origin.overrides),

@@ -12,10 +12,11 @@ from markupsafe import Markup
 from prefrl.evaluate.card import Hindsight, Mistakes
 from prefrl.evaluate.summary import STAGES
 from prefrl.report import plots
+from prefrl.report.costs import Spent, account, costs
 from prefrl.report.facts import Facts
 from prefrl.report.plots import Line, Series
 from prefrl.report.records import Record, visible, whole
-from prefrl.report.words import show_count, show_number
+from prefrl.report.words import show_count, show_number, show_time
 from prefrl.stats.estimates import Estimate
 
 ROUNDING = 1e-9
@@ -430,4 +431,19 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
             plots.stacked("time", at, seconds),
             "Wall time by stage, in the colours of the bar below.",
         ),
+        *_outside(facts),
     )
+
+
+def _outside(facts: Facts) -> tuple[Card, ...]:
+    """Where a simulator or a simulated teacher hides what is dear: the same run with a real world and real people."""
+    steps, labels = sum(n or 0 for n in facts.steps.values()), facts.labels["answered"] or 0
+    if not facts.seconds or not (facts.rate or labels):
+        return ()
+    waited = facts.seconds.get("label", 0.0) if facts.people else 0.0
+    machine = sum(facts.seconds.values()) - waited
+    found = costs(Spent(steps, facts.rate, labels, facts.people, machine))
+    drawn = [(one.who, one.seconds, show_time(one.seconds)) for one in found]
+    colours = {"the world": "sample", "people": "label", "the machine": "improve"}
+    figure = plots.spans("outside", drawn, [colours[one.who] for one in found])
+    return (Card("Out in the world", figure, account(found)),)

@@ -57,6 +57,10 @@ class Facts:
     labels: Mapping[str, int | None]
     """Those asked, answered and skipped, and how many of the answers are demonstrations."""
     steps: Mapping[str, int | None]
+    rate: float | None
+    """Steps a second in the world; None where there is none outside, or nobody knows."""
+    people: float | None
+    """Seconds that people took to answer; None where nobody measured it."""
     seconds: Mapping[str, float]
     """By stage; only stages that were timed."""
     total_seconds: float | None
@@ -116,6 +120,8 @@ def gather(record: Record) -> Facts:
         shown=None if _has_fitted(record) else whole(last("improve/demonstrations")),
         labels=total("labels", ("asked", "answered", "skipped", "demonstrations"), "label"),
         steps=total("steps", ("learn", "query", "evaluate"), "steps"),
+        rate=number(summary.get("steps_per_second")),
+        people=number(summary.get("people_seconds")),
         seconds=seconds,
         total_seconds=number(mapping(summary.get("seconds")).get("total")) or sum(seconds.values()) or None,
         versions={visible(k, 100): visible(v, 200) for k, v in mapping(summary.get("versions")).items()},

@@ -293,6 +293,25 @@ def bars(name: str, found: Sequence[Bar], label: str) -> Markup:
     return _svg(name, draw) if kept else Markup("")
 
 
+def spans(name: str, found: Sequence[tuple[str, float, str]], colours: Sequence[str]) -> Markup:
+    """Lying bars of (label, length, how it is written), over each other; empty without any."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        y, lengths = np.arange(len(found)), [length for _, length, _ in found]
+        axes.barh(y, lengths, 0.6, color=[COLOURS[name] for name in colours])
+        for at, (_, length, written) in zip(y, found, strict=True):
+            axes.annotate(written, (length, at), (5, 0), textcoords="offset points", va="center")
+        axes.set_yticks(y, [label for label, _, _ in found])
+        axes.set_xlim(0, 1.35 * max(lengths))  # room for what is written behind the longest
+        axes.xaxis.set_visible(False)
+        axes.grid(visible=False)
+        axes.spines["bottom"].set_visible(False)
+        axes.invert_yaxis()
+
+    return _svg(name, draw) if any(length > 0 for _, length, _ in found) else Markup("")
+
+
 def scatter(name: str, x: Sequence[float], y: Sequence[float], labels: tuple[str, str], colour: str) -> Markup:
     """A dot for each candidate; empty with under three."""
 

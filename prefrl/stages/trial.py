@@ -7,6 +7,8 @@ from pathlib import Path
 
 from prefrl.components import Settings
 from prefrl.config import Config
+from prefrl.protocols import DrawnTask
+from prefrl.report.costs import Spent
 from prefrl.store import Store
 
 
@@ -16,8 +18,8 @@ def shrink(config: Config) -> Config:
     return config.model_copy(update=parts)
 
 
-def estimate(config: Config) -> float:
-    """Seconds that a run would take, about, from one small round of the true task in a temporary folder.
+def estimate(config: Config) -> Spent:
+    """What a run would take, about, from one small round of the true task in a temporary folder.
 
     Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
     """
@@ -34,5 +36,9 @@ def estimate(config: Config) -> float:
         "fit": config.loop.rounds * config.loop.labels / 2 / max(small.loop.labels, 1),
         "improve": config.loop.rounds * config.learner.work() / small.learner.work(),
     }
-    evaluation = start["seconds/evaluate"] * (config.loop.rounds + 1)
-    return evaluation + sum(one.get(f"seconds/{stage}", 0.0) * factor for stage, factor in growth.items())
+    evaluations = config.loop.rounds + 1
+    seconds = sum(one.get(f"seconds/{stage}", 0.0) * factor for stage, factor in growth.items())
+    steps = {"learn": growth["improve"], "query": growth["sample"], "evaluate": evaluations / 2}  # of the two in `one`
+    spent = sum(one.get(f"steps/{purpose}", 0.0) * factor for purpose, factor in steps.items())
+    rate = loop.task.fps if isinstance(loop.task, DrawnTask) else None
+    return Spent(round(spent), rate, config.loop.labels, None, seconds + start["seconds/evaluate"] * evaluations)

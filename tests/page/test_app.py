@@ -182,6 +182,7 @@ def test_how_an_answer_came_about_is_kept_beside_it(service: Service, ann: TestC
     assert (about["comment"], about["flags"], about["input"]) == ("hm", ["blurred"], "touch")
     assert about["timings"]["decision_ms"] == 400.5
     assert about["timings"]["hidden_ms"] == 0
+    assert service.store.attention() == 0.4005
 
 
 def test_the_same_submission_twice_is_one_answer_with_one_number(service: Service, ann: TestClient) -> None:

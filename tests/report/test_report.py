@@ -422,7 +422,7 @@ def test_only_png_files_of_the_examples_folder_are_shown(tmp_path: Path) -> None
 def test_figures_are_well_formed_and_take_the_pages_colours(tmp_path: Path) -> None:
     html = write_report(whole_run(tmp_path / "run")).read_text("utf-8")
     figures = [part.split("</svg>")[0] + "</svg>" for part in html.split("<svg")[1:]]
-    assert len(figures) == 8
+    assert len(figures) == 9
     for figure in figures:
         ElementTree.fromstring("<svg" + figure)
         assert "#0101" not in figure
