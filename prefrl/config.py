@@ -307,6 +307,8 @@ def _apply(data: Json, override: str) -> None:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise ConfigError(f"{path}: {text!r} is not a YAML value") from None
+    if isinstance(value, dict | list) and not text.lstrip().startswith(("{", "[")):
+        value = text  # a sentence with a colon or a dash in it: on one line nobody writes a group in any other way
     *parents, last = path.split(".")
     for parent in parents:
         data = data.setdefault(parent, {})

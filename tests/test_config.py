@@ -152,6 +152,14 @@ def test_a_wrong_setting_gets_one_line_that_helps(override: str, message: str) -
     assert "\n" not in str(caught.value)
 
 
+def test_a_sentence_with_a_colon_or_a_dash_is_a_sentence() -> None:
+    for goal in ("Rule: who stays nearer to the line?", "- which of the two"):
+        assert Config.load(TOY, [f"goal={goal}"]).goal == goal
+    assert (
+        Config.load(TOY, ["reward.combine={by: worst}"]).dump() == Config.load(TOY, ["reward.combine.by=worst"]).dump()
+    )
+
+
 def test_every_mistake_is_named() -> None:
     with pytest.raises(ConfigError) as caught:
         Config.load(TOY, ["learner.epochs=0", "learner.clip=-1", "loop.rounds=0"])

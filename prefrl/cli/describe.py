@@ -33,10 +33,25 @@ def explain(name: str | None) -> list[RenderableType]:
     if name in ALWAYS:
         return _component(name, schema_of(ALWAYS[name]))
     roles: list[Role] = [role for role in TABLE if name in kinds(role)]
-    if not roles:
-        known = [*ALWAYS, *(kind for role in TABLE for kind in kinds(role)), *presets()]
+    if roles:
+        return [part for role in roles for part in _component(f"{role[:-1]} kind {name}", described(role, name))]
+    parts = dict(_parts())
+    if name not in parts:
+        known = [*ALWAYS, *(kind for role in TABLE for kind in kinds(role)), *parts, *presets()]
         raise ConfigError(f"nothing is called {name!r}; {suggest(name, known)}")
-    return [part for role in roles for part in _component(f"{role[:-1]} kind {name}", described(role, name))]
+    title, group = parts[name]
+    return _component(title, group)
+
+
+def _parts() -> Iterator[tuple[str, tuple[str, Json]]]:
+    """Kinds of a part of a component, a learner's policy say: its name, and where it is set with its settings."""
+    every = [(role, kind) for role in TABLE for kind in kinds(role)]
+    for role, kind in every:
+        whole = described(role, kind)
+        for setting, one in whole["properties"].items():
+            for name, at in one.get("discriminator", {}).get("mapping", {}).items():
+                group = {**whole["$defs"][_name({"$ref": at})], "$defs": whole["$defs"]}
+                yield name, (f"{role[:-1]}.{setting}.kind={name}, with {role[:-1]}.kind={kind}", group)
 
 
 def _component(title: str, described: Json) -> list[RenderableType]:

@@ -151,6 +151,7 @@ def test_a_bundle_moves_labels_between_folders(prefrl: Shell) -> None:
         ("evaluate .", "holds neither a run"),
         ("fit . --out reward", "--config"),
         ("describe contrl", "did you mean 'control'?"),
+        ("describe floow", "did you mean 'flow'?"),
     ],
 )
 def test_a_mistake_gets_a_line_on_stderr_and_status_two(prefrl: Shell, line: str, message: str) -> None:
@@ -195,6 +196,7 @@ def test_every_kind_is_described_with_every_setting_explained(prefrl: Shell, nam
 
 def test_types_and_grouped_settings_are_told_in_words(prefrl: Shell) -> None:
     said = {"fitting": "float ≥ 0 | adaptive", "judge": "[str, str]", "mlp": "combine.caution"}
+    said |= {"flow": "learner.policy.kind=flow, with learner.kind=control"}
     for kind, words in said.items():
         assert prefrl(f"describe {kind}") == 0
         assert words in prefrl.out
