@@ -192,9 +192,8 @@ def demonstrate(
     """Let an expert show whole episodes, which can be cloned: `learner.data=FOLDER` reads them."""
     from prefrl import stages
     from prefrl.cli.console import say
-    from prefrl.storage.log import has_store
 
-    _refuse(has_store(out), f"{out} holds answers already: say with --out where new demonstrations go")
+    _refuse(_holds_anything(out), f"{out} holds answers already: say with --out where new demonstrations go")
     policy = [f"labeler.policy={json.dumps(str(expert))}"] if expert else []
     shows = ["labeler.kind=expert", f"labeler.episodes={episodes}", f"labeler.noise={noise}", *policy]
     asks = ["select.kind=uniform", "select.candidates=1", "loop.labels=0"]
@@ -440,6 +439,17 @@ def _load(source: str, overrides: list[str] | None) -> Config:
     if Path(source).is_dir():
         return Config.reopen(Path(source) / "config.yaml", changes)
     return Config.load(source, changes)
+
+
+def _holds_anything(folder: Path) -> bool:
+    """Whether a store lies there in which something was asked; one that a mistake left behind may be used."""
+    from prefrl.storage.log import has_store
+    from prefrl.store import Store
+
+    if not has_store(folder):
+        return False
+    with Store(folder, write=False) as store:
+        return store.sequence > 0
 
 
 def _dry_run(config: Config, seeds: int) -> None:

@@ -46,8 +46,8 @@ def label(
     if (folder / "checkpoints").exists():
         raise RunError(f"{folder} holds a run, which asks for its own labels: choose another folder")
     with Store(folder) as store:
-        _keep_config(config, folder)
         loop = config.build(store)
+        _keep_config(config, folder)  # what cannot be built is not kept: a mistake can be corrected in the same folder
         if policy is not None:
             loop.learner.load(load_state(policy.folder, "learner"))
             loop.reward.load(load_state(policy.folder, "reward"))

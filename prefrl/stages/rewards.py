@@ -67,8 +67,8 @@ def with_reward(config: Config, saved: Path, overrides: Sequence[str] = ()) -> C
     for one that would need another fit.
     """
     folder, fitted = open_saved(saved).folder, open_saved(saved).config
-    said = [one for one in overrides if one.startswith("reward.")]
-    reward = Config.reopen(folder / "config.yaml", said).reward
+    chosen = [one for one in overrides if one.startswith("reward.")]
+    reward = Config.reopen(folder / "config.yaml", chosen).reward
     _check_only_combined(dict(flat(fitted.reward.model_dump())), dict(flat(reward.model_dump())), saved)
     update: Json = {"reward": reward, "loop": config.loop.model_copy(update={"labels": 0})}
     if type(fitted.task) is type(config.task):

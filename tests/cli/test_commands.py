@@ -310,6 +310,13 @@ def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL}") == 0
 
 
+def test_demonstrations_may_go_where_a_mistake_left_nothing_but_a_folder(prefrl: Shell) -> None:
+    assert prefrl("demonstrate control/pendulum --episodes 1 --expert nobody --out shown") == 2
+    assert prefrl("demonstrate control/pendulum --episodes 1 --out shown") == 0
+    assert prefrl("demonstrate control/pendulum --episodes 1 --out shown") == 2
+    assert "shown holds answers already" in prefrl.err
+
+
 def test_a_run_that_never_learns_anything_says_so(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL} labeler.tie_within=1e6") == 2
     assert "nothing to fit: all 24 judgements are ties" in prefrl.out
