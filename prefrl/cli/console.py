@@ -20,7 +20,7 @@ from rich.text import Text
 
 from prefrl.components import resume_command
 from prefrl.evaluate.card import ReportCard
-from prefrl.kinds import find, named
+from prefrl.kinds import named
 from prefrl.loop import Loop
 from prefrl.report import card_words
 from prefrl.types import Fields, Round
@@ -186,16 +186,25 @@ def summary_table(summary: Fields) -> Table:
     """`summary.json` for people."""
     title = Text(f"{summary['task']} ({summary['kind']}), seed {summary['seed']}")
     table = Table(title=title, show_header=False, box=None)
-    gold = f"{number(summary['gold_before'])} → {number(summary['gold_after'])} (best {number(summary['gold_best'])})"
-    table.add_row("gold", Text(gold, style="bold blue"))
-    table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
-    if (kind := find(summary["kind"])) and kind.drifts:
+    table.add_row("gold", Text(_gold(summary), style="bold blue"))
+    accuracy = summary["reward_accuracy"]
+    table.add_row("reward accuracy, held out", "not measured" if accuracy is None else number(accuracy))
+    if summary["kl"] is not None:
         table.add_row("kl to the start, nats", number(summary["kl"]))
+    if summary["fluency_after"] is not None:
         table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
     for name in ("labels", "steps"):
         table.add_row(name, ", ".join(f"{k} {v:,}" for k, v in summary[name].items()))
     table.add_row("time", ", ".join(f"{k} {duration(v)}" for k, v in summary["seconds"].items()))
     return table
+
+
+def _gold(summary: Fields) -> str:
+    """Before and after; or that the task has none, and what stands in its place."""
+    before, after, best = (summary[f"gold_{when}"] for when in ("before", "after", "best"))
+    if after is None:
+        return "the task has none: the report says how else it did"
+    return f"{number(before)} → {number(after)} (best {number(best)})"
 
 
 def metrics_table(title: str, metrics: Mapping[str, float]) -> Table:
