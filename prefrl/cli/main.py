@@ -7,7 +7,6 @@ import os
 import shlex
 import sys
 from datetime import datetime
-from enum import StrEnum
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,10 +21,10 @@ from prefrl.cli.many import commands as many_commands
 from prefrl.cli.own import by_name, load
 from prefrl.cli.several import Ranks, on
 from prefrl.cli.store import commands as store_commands
+from prefrl.cli.texts import Folder, refuse
+from prefrl.cli.texts import commands as text_commands
 
 if TYPE_CHECKING:  # heavy modules are imported by the command that needs them: --help must answer at once
-    from collections.abc import Iterator
-
     from prefrl.config import Config
 
 app = typer.Typer(
@@ -36,21 +35,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+app.add_typer(text_commands)
 app.add_typer(exchange_commands)
 app.add_typer(film_commands)
 app.add_typer(many_commands)
 app.add_typer(store_commands)
 Source = Annotated[str, typer.Argument(help="A preset (see `prefrl presets`), a YAML file, or a run's folder.")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="Settings, as dotted.key=value.", show_default=False)]
-Folder = Annotated[Path, typer.Argument(help="A run's folder.", exists=True, file_okay=False)]
-
-
-class By(StrEnum):
-    """Who says which response is better."""
-
-    reward = "reward"
-    gold = "gold"
-    labeler = "labeler"
 
 
 FEW = 20
@@ -87,9 +78,9 @@ def run(
 
     overrides = by_name(overrides or [])
     config = _load(source, overrides)
-    _refuse(seeds > 1 and ranks > 1, "--seeds and --ranks are two ways to use several processes: choose one")
-    _refuse(jobs > 1 and seeds == 1, "--jobs goes with --seeds: how many of its runs go on at once")
-    _refuse(seeds > 1 and Path(source).is_dir(), "--seeds takes a preset or a YAML file, not a run's folder")
+    refuse(seeds > 1 and ranks > 1, "--seeds and --ranks are two ways to use several processes: choose one")
+    refuse(jobs > 1 and seeds == 1, "--jobs goes with --seeds: how many of its runs go on at once")
+    refuse(seeds > 1 and Path(source).is_dir(), "--seeds takes a preset or a YAML file, not a run's folder")
     if seeds > 1 and not dry_run:
         drive_all(over_seeds(source, overrides, seeds), out or _new_folder(source), jobs, "local")
         return
@@ -149,11 +140,11 @@ def label(
     from prefrl.storage.log import has_store
 
     there = serve and has_store(Path(source)) and (out is None or out.resolve() == Path(source).resolve())
-    _refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
-    _refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
+    refuse(terminal and serve, "--terminal and --serve are two ways of asking: choose one")
+    refuse(not serve and (bool(host) or port is not None), "--host and --port go with --serve")
     own = there and (given is not None or bool(policies))
-    _refuse(own, f"{source} has queries of its own: --given and --policy are for new ones; say with --out where to")
-    _refuse(bool(policies) and given is not None, "--policy and --given are two sources of candidates: choose one")
+    refuse(own, f"{source} has queries of its own: --given and --policy are for new ones; say with --out where to")
+    refuse(bool(policies) and given is not None, "--policy and --given are two sources of candidates: choose one")
     folder = Path(source) if there else out or Path("labels")
     extra = ["labeler.kind=terminal", f"labeler.clips={json.dumps(str(folder / 'clips'))}"] if terminal else []
     if serve:
@@ -193,7 +184,7 @@ def demonstrate(
     from prefrl import stages
     from prefrl.cli.console import say
 
-    _refuse(_holds_anything(out), f"{out} holds answers already: say with --out where new demonstrations go")
+    refuse(_holds_anything(out), f"{out} holds answers already: say with --out where new demonstrations go")
     policy = [f"labeler.policy={json.dumps(str(expert))}"] if expert else []
     shows = ["labeler.kind=expert", f"labeler.episodes={episodes}", f"labeler.noise={noise}", *policy]
     asks = ["select.kind=uniform", "select.candidates=1", "loop.labels=0"]
@@ -284,84 +275,6 @@ def evaluate(
 
 
 @app.command()
-def win_rate(
-    folder: Folder,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="With --by labeler: its settings, as labeler.key=value.", show_default=False),
-    ] = None,
-    against: Annotated[
-        Path | None, typer.Option(help="Another run; default: the policy that the run started from.", exists=True)
-    ] = None,
-    by: Annotated[By, typer.Option(help="Who says which response is better.")] = By.reward,
-    reward: Annotated[
-        Path | None, typer.Option(help="With --by reward: a run, or what `prefrl fit` wrote; default: the run's own.")
-    ] = None,
-    prompts: Annotated[
-        Path | None,
-        typer.Option(help="A file or a data set of prompts; default: the evaluation's.", exists=True),
-    ] = None,
-    count: Annotated[
-        int | None, typer.Option(help="So many distinct prompts; default: 256, or all of a file.", min=1)
-    ] = None,
-    samples: Annotated[int, typer.Option(help="Responses to each prompt, on either side.", min=1)] = 1,
-    seed: Annotated[int, typer.Option(help="Of prompts and responses.", min=0)] = 0,
-    json_: Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")] = None,
-) -> None:
-    """Say how often the newest policy of a text run beats its start, or another run's policy."""
-    from prefrl.cli.console import console, counted, say, win_rate_line, win_rate_table
-    from prefrl.duel import Duel
-    from prefrl.storage.files import write_file
-
-    _refuse(bool(overrides) and by is not By.labeler, "settings of a labeler go with --by labeler")
-    _refuse(reward is not None and by is not By.reward, "--reward goes with --by reward")
-    settings = tuple(overrides or ())
-    duel = Duel(folder, against, by.value, reward, settings, prompts, count, samples, seed)
-    found = duel.outcome(lambda items, total: counted(items, total, "prompts"), say)
-    say(win_rate_line(duel, found), "bold")
-    console.print(win_rate_table(found))
-    if json_ is not None:
-        write_file(json_, json.dumps(duel.record(found), indent=1).encode())
-
-
-@app.command()
-def generate(
-    folder: Folder,
-    prompts: Annotated[Path, typer.Option(help="A file or a data set with prompts or messages.", exists=True)],
-    to: Annotated[Path, typer.Option(help="JSON lines: the prompt, and the responses.")] = Path("responses.jsonl"),
-    samples: Annotated[int, typer.Option(help="Responses to each prompt.", min=1)] = 1,
-    temperature: Annotated[float, typer.Option(help="0 takes the most probable token.", min=0)] = 1.0,
-    top_k: Annotated[int, typer.Option(help="Draw among so many tokens; 0 for all.", min=0)] = 0,
-    top_p: Annotated[float, typer.Option(help="Draw among tokens of this share.", min=0, max=1)] = 1.0,
-    best_of: Annotated[
-        int | None,
-        typer.Option(help="Of so many responses write the one that the run's reward model scores highest.", min=1),
-    ] = None,
-) -> None:
-    """Have the newest policy of a text run answer prompts; `prefrl label --given` reads what is written."""
-    from prefrl import stages
-    from prefrl.cli.console import counted, say
-
-    _refuse(to.exists(), f"{to} is there already: choose another name with --to")
-    _refuse(bool(best_of) and samples > 1, "--best-of keeps one of N responses to each prompt: leave --samples out")
-    same = temperature == 0 or top_k == 1 or top_p == 0
-    _refuse(bool(best_of) and same, "--best-of wants responses that differ: raise --temperature, --top-k or --top-p")
-    policy = stages.policy_of(folder)
-    texts = stages.prompts_for(policy, prompts)
-    how = stages.Drawn(best_of or samples, temperature, top_k, top_p)
-    rows: Iterator[dict[str, object]]
-    if best_of:
-        chosen = stages.generate_best(policy, stages.reward_of(folder, policy.task), texts, how)
-        rows = ({"prompt": prompt, "responses": [found], "scores": [score]} for prompt, found, score in chosen)
-    else:
-        rows = ({"prompt": prompt, "responses": found} for prompt, found in stages.generate(policy, texts, how))
-    for row in counted(rows, len(texts), "prompts"):
-        with to.open("a", encoding="utf-8") as file:  # line by line: what was written stays, whatever comes
-            file.write(json.dumps(row, ensure_ascii=False) + "\n")
-    say(f"{len(texts)} prompts answered in {to}")
-
-
-@app.command()
 def report(folder: Folder) -> None:
     """Write a run's report.html again, also while it goes on."""
     from prefrl.cli.console import say
@@ -406,12 +319,6 @@ def doctor() -> None:
     from prefrl.cli.doctor import diagnose
 
     console.print(diagnose())
-
-
-def _refuse(wrong: bool, why: str) -> None:
-    """Options that would be ignored are a mistake."""
-    if wrong:
-        raise ValueError(why)
 
 
 def _progress(folder: Path) -> str:
