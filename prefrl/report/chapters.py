@@ -437,7 +437,8 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
 
 def _outside(facts: Facts) -> tuple[Card, ...]:
     """Where a simulator or a simulated teacher hides what is dear: the same run with a real world and real people."""
-    steps, labels = sum(n or 0 for n in facts.steps.values()), facts.labels["answered"] or 0
+    steps = sum(facts.steps[purpose] or 0 for purpose in ("learn", "query", "evaluate"))  # the real ones
+    labels = facts.labels["answered"] or 0
     if not facts.seconds or not (facts.rate or labels):
         return ()
     waited = facts.seconds.get("label", 0.0) if facts.people else 0.0
