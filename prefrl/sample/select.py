@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Generic, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from prefrl.components import Settings
 from prefrl.protocols import RewardModel, Selector
@@ -31,6 +31,15 @@ class UnscoredSettings(Settings):
     """K: how many candidates a query puts side by side; 1 for an expert, who shows what to do instead."""
     newest: float = Field(1.0, gt=0, le=1)
     """The share of the pool, from its end where the newest are, that may be asked about."""
+    best_of: int = Field(1, ge=1)
+    """With one candidate, that of so many from the same start which the newest reward scores highest: people are then
+    shown the better answer, to make it better still. Before the first fit it is any of them."""
+
+    @model_validator(mode="after")
+    def _one_is_the_best(self) -> UnscoredSettings:
+        if self.best_of > 1 and (self.kind != "uniform" or self.candidates > 1):
+            raise ValueError("best_of chooses the one candidate that is shown: it takes kind=uniform and candidates=1")
+        return self
 
     def build(self) -> Selector[C]:
         return Coverage(self) if self.kind == "coverage" else Uniform(self)
@@ -38,13 +47,22 @@ class UnscoredSettings(Settings):
 
 @dataclass(frozen=True)
 class Uniform(Generic[C]):
-    """Draws queries at random."""
+    """Draws queries at random; with `best_of` each is what the reward likes best of a group drawn at random."""
 
     settings: UnscoredSettings
 
     def select(self, pool: Sequence[C], reward: RewardModel[C], count: int, rng: np.random.Generator) -> list[Query[C]]:
         pool = newest(pool, self.settings.newest)
-        return asked(pool, groups(pool, self.settings.candidates, rng)[:count])
+        drawn = groups(pool, max(self.settings.candidates, self.settings.best_of), rng)[:count]
+        if self.settings.best_of > 1:
+            drawn = _best(pool, reward, drawn) if reward.fitted else drawn[:, :1]
+        return asked(pool, drawn)
+
+
+def _best(pool: Sequence[C], reward: RewardModel[C], drawn: Integers) -> Integers:
+    """(Q, 1) indices of the candidate with the highest score in each of (Q, K)."""
+    scores = reward.score([pool[i] for i in drawn.flat]).reshape(drawn.shape)
+    return np.take_along_axis(drawn, scores.argmax(1)[:, None], 1)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,9 @@ class Fake:
         second = np.array([len(c.text) * (1 if c.prompt == "sure" else -1) for c in candidates], float)
         return np.stack([first, second])[: self.members]
 
+    def score(self, candidates: list[Response]) -> Floats:
+        return np.array([len(c.text) for c in candidates], float)
+
     def member_scores(self, candidates: list[Response]) -> Floats:
         """Settled scores are on a scale on which the members seem to disagree about "sure" the most."""
         signs = np.array([1.0 if c.prompt == "sure" else 0.0 for c in candidates])
@@ -158,6 +161,20 @@ def test_more_proposals_find_more_informative_queries(make_segment: Callable[...
         return float(information(scores).mean())
 
     assert found(12) > found(1)
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_of_the_answers_to_a_prompt_the_better_one_is_shown_once_there_is_a_reward(fitted: bool) -> None:
+    reward, pool = Fake(), [*responses("a", 6), *responses("b", 6)]
+    reward.fitted = fitted
+    best = build(kind="uniform", candidates=1, best_of=3)
+    shown = [best.select(pool, reward, 4, np.random.default_rng(seed)) for seed in range(20)]
+    assert all(len(query.candidates) == 1 for queries in shown for query in queries)
+    # Of six texts in two groups of three, the longest is the best of one, and the two shortest are the best of none.
+    texts = [{query.candidates[0].text for query in queries} for queries in shown]
+    assert all({"a xxxxx", "b xxxxx"} <= some for some in texts) is fitted
+    assert any({"a ", "a x", "b ", "b x"} & some for some in texts) is not fitted
+    assert {len(queries) for queries in shown} == {4}
 
 
 def test_settings_say_what_a_kind_cannot_do() -> None:
