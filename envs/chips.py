@@ -25,9 +25,9 @@ class Places(NamedTuple):
     """What the pins of n plans lie at; infinite where a net has none yet."""
 
     low: Floats
-    """(n, N, 2)."""
+    """(n, 2, N)."""
     high: Floats
-    """(n, N, 2)."""
+    """(n, 2, N)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +96,10 @@ class Chip:
         _, macros, offsets = self._pins
         middles = self.middles(cells)
         there = (macros == BOARD) | (cells[:, macros] >= 0)  # (n, P)
-        at = np.where((macros == BOARD)[:, None], 0.0, middles[:, macros]) + offsets  # (n, P, 2)
-        low = np.minimum.reduceat(np.where(there[..., None], at, np.inf), self._heads, 1)
-        high = np.maximum.reduceat(np.where(there[..., None], at, -np.inf), self._heads, 1)
+        # Pins last, in a row in memory: it takes a third of the time.
+        at = np.where(macros == BOARD, 0.0, middles.transpose(0, 2, 1)[:, :, macros]) + offsets.T  # (n, 2, P)
+        low = np.minimum.reduceat(np.where(there[:, None], at, np.inf), self._heads, 2)
+        high = np.maximum.reduceat(np.where(there[:, None], at, -np.inf), self._heads, 2)
         return Places(low, high)
 
     def wire(self, boxes: Places) -> Floats:
@@ -108,19 +109,20 @@ class Chip:
 
     def demand(self, boxes: Places) -> Floats:
         """(n, bins, bins) rows and columns: how much wire there is for the width of a bin, if it is spread evenly."""
-        size = self.extent / self.bins
-        lies = np.isfinite(boxes.low[..., 0])
-        low, high = (np.where(lies[..., None], side, 0.0) for side in boxes)
-        length = (high - low).sum(-1)  # (n, N)
+        size = (self.extent / self.bins).astype(np.float32)[:, None]
+        lies = np.isfinite(boxes.low[:, 0])
+        low, high = (np.where(lies[:, None], side, 0.0).astype(np.float32) for side in boxes)
+        length = (high - low).sum(1)  # (n, N)
         # A straight wire has no area: it runs through one bin's width.
         middle, half = (low + high) / 2, np.maximum(high - low, size) / 2
         low, high = middle - half, middle + half
-        edges = np.arange(self.bins) * size[:, None]  # (2, bins)
-        begin = np.maximum(low[..., None], edges)
-        share = np.clip(np.minimum(high[..., None], edges + size[:, None]) - begin, 0.0, None) / size[:, None]
+        edges = (np.arange(self.bins, dtype=np.float32) * size)[:, None]  # (2, 1, bins)
+        share = np.minimum(high[..., None], edges + size[:, None])
+        share -= np.maximum(low[..., None], edges)
+        share = np.maximum(share, 0.0, out=share) / size[:, None]
         # (n, N): the wire in a bin that the box covers.
-        weight = np.where(lies, length / ((high - low) / size).prod(-1), 0.0) / size.mean()
-        columns, rows = share[:, :, 0], share[:, :, 1]  # (n, N, bins)
+        weight = length / ((high - low) / size).prod(1) / size.mean()
+        columns, rows = share[:, 0], share[:, 1]  # (n, N, bins)
         found: Floats = rows.transpose(0, 2, 1) @ (columns * weight[..., None])
         return found
 
@@ -138,17 +140,17 @@ class Chip:
         """
         nets, macros, offsets = self._pins
         mine = macros == macro
-        corner = np.arange(self.grid)[:, None] * self.cell  # (G, 2)
+        corner = np.arange(self.grid) * self.cell[:, None, None]  # (2, 1, G)
         # Several pins of one net on a macro: the box grows by the farthest on either side.
         own, heads = np.unique(nets[mine], return_index=True)
         if not len(own):
             return np.zeros((len(boxes.low), self.grid, self.grid))
         ends = offsets[mine] + self.netlist.sizes[macro] / 2
-        least, most = np.minimum.reduceat(ends, heads, 0), np.maximum.reduceat(ends, heads, 0)
-        low, high = boxes.low[:, own, None], boxes.high[:, own, None]  # (n, K, 1, 2)
-        grown = np.maximum(high, corner + most[:, None]) - np.minimum(low, corner + least[:, None])
-        before = np.maximum(boxes.high - boxes.low, 0.0)[:, own, None]
-        columns, rows = np.moveaxis((grown - before).sum(1), -1, 0)  # (n, G) each
+        least, most = (f.reduceat(ends, heads, 0).T[..., None] for f in (np.minimum, np.maximum))  # (2, K, 1)
+        low, high = boxes.low[:, :, own, None], boxes.high[:, :, own, None]  # (n, 2, K, 1)
+        grown = (np.maximum(high, corner + most) - np.minimum(low, corner + least)).sum(2)
+        grown -= np.maximum(high - low, 0.0).sum(2)
+        columns, rows = grown[:, 0], grown[:, 1]  # (n, G)
         found: Floats = rows[:, :, None] + columns[:, None, :]
         return found
 

@@ -44,7 +44,7 @@ def acted(policy: MapsPolicy, seed: int) -> Rollout:
 
 def moved() -> MapsPolicy:
     """Some way from its start, where every action is as probable."""
-    policy = MapsPolicySettings(hidden=(7, 5), gain=1.0).build(plan(), np.random.default_rng(0))
+    policy = MapsPolicySettings(hidden=(7, 5), gain=2.0).build(plan(), np.random.default_rng(0))
     policy.observe(acted(policy, 3).observations)
     order = torch.Generator().manual_seed(1)
     for p in policy.parameters():
@@ -106,7 +106,7 @@ def test_logits_are_what_the_maps_count_for_and_what_is_added_for_each_action() 
     outputs = x @ named["actor_2"] + named["actor_bias_2"]
     told = plan().told(rollout.observations.reshape(-1, 21))
     count = len(plan().maps)
-    logits = outputs[:, count:] + np.einsum("baf,bf->ba", told, outputs[:, :count])
+    logits = outputs[:, count:] + 2 * np.einsum("baf,bf->ba", told, outputs[:, :count])
     assert rollout.legal is not None
     logits = np.where(rollout.legal.reshape(-1, 144), logits, -np.inf)
     logits -= np.log(np.exp(logits).sum(1, keepdims=True))
@@ -164,7 +164,7 @@ def test_what_was_seen_does_not_change_what_it_does() -> None:
 
 
 def test_saved_and_loaded_it_is_the_same_policy() -> None:
-    policy, other = moved(), MapsPolicySettings(hidden=(7, 5), gain=1.0).build(plan(), np.random.default_rng(5))
+    policy, other = moved(), MapsPolicySettings(hidden=(7, 5), gain=2.0).build(plan(), np.random.default_rng(5))
     other.load(policy.state())
     for one, another in zip(policy.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(one, another, rtol=0, atol=0)
