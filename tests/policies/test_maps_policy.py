@@ -1,7 +1,8 @@
 """The policy over maps, and masks in every policy of discrete actions, on a small floorplan."""
 
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from prefrl.components import ConfigError
 from prefrl.envs.floorplan import FloorplanSettings, FloorplanTask
-from prefrl.envs.plans import CELLS
+from prefrl.envs.plans import CELLS, random_plans
 from prefrl.envs.tabular import GridworldSettings
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.improve.gradient import Batch, adam, step
@@ -18,9 +19,11 @@ from prefrl.policies.acting import Acting
 from prefrl.policies.maps import MappedDecisions, MapsPolicy, MapsPolicySettings
 from prefrl.policies.mlp import MLPPolicySettings
 from prefrl.policies.rollout import Rollout, collect, whole_episodes
+from prefrl.protocols import StepRewardModel
 from prefrl.reward_models.linear import LinearSettings
+from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
-from prefrl.types import Segment
+from prefrl.types import Bools, Floats, Segment
 
 
 @cache
@@ -190,3 +193,64 @@ def test_examples_for_a_clone_know_what_was_legal() -> None:
     # Nearly even at first: the likelihood of a choice among the legal ones, and not among all.
     logp = policy.log_prob(examples)[0].detach().numpy()
     np.testing.assert_allclose(logp, -np.log(rollout.legal.sum(-1)).reshape(-1, 1), atol=0.2)
+
+
+class Truth:
+    """The gold of a step, seen in the next one's observation; as a reward for tests."""
+
+    members, memory, fitted = 1, 1, True
+
+    def rewards(self, observations: Floats, actions: Floats, begins: Bools | None = None) -> Floats:
+        found: Floats = -10 * observations[..., :2].sum(-1)
+        return found
+
+
+def built(seed: int) -> ControlLearner:
+    settings = ControlLearnerSettings.model_validate(
+        {
+            "environments": 32,
+            "steps_per_round": 640,
+            "rollout_steps": 5,
+            "epochs": 4,
+            "discount": 1.0,
+            "target_kl": 0.05,
+        }
+        | {"minibatch": 80, "policy": {"kind": "maps", "hidden": [16]}}
+    )
+    return settings.build(plan(), np.random.default_rng(seed))
+
+
+def improved(learner: ControlLearner, store: Store[Segment], seed: int) -> None:
+    learner.improve(cast("StepRewardModel", Truth()), store, np.random.default_rng(seed))
+
+
+def test_it_learns_where_to_place_macros(store: Store[Segment], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("prefrl.improve.control.step_rewards", lambda reward: reward)
+    learner, totals = built(0), []
+    for number in range(8):
+        improved(learner, store, number)
+        recent = learner.state()["recent"]
+        totals.append(recent["final_observations"][recent["terminated"]][:, 2:4].sum(1).mean())
+    assert totals[0] > 1.8  # random plans have 2
+    assert totals[-1] < 1.7
+
+
+def test_a_saved_learner_goes_on_bit_for_bit(
+    store: Store[Segment], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("prefrl.improve.control.step_rewards", lambda reward: reward)
+    learner, other = built(0), built(1)
+    improved(learner, store, 0)
+    save_state(tmp_path, "learner", learner.state())
+    other.load(load_state(tmp_path, "learner"))
+    for one in (learner, other):
+        improved(one, store, 1)
+    for mine, theirs in zip(learner.policy.parameters(), other.policy.parameters(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=0)
+
+
+def test_what_is_seen_does_not_hang_on_how_the_gold_is_weighed() -> None:
+    states = random_plans(plan().world, 3, np.random.default_rng(0))
+    other = FloorplanSettings(macros=4, grid=12, wire_weight=0.0, congestion_weight=7.0).build()
+    np.testing.assert_array_equal(plan().world.observe(states), other.world.observe(states))
+    np.testing.assert_array_equal(plan().world.maps(states), other.world.maps(states))
