@@ -120,8 +120,6 @@ class MapsPolicy:
             observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
         ) -> tuple[Floats, Floats, Memory]:
             logits = self._act(scaling(observations), self._task.told(observations), layers)
-            # Without a simulator at hand, an observation says what there is.
-            legal = self._task.legal(observations) if legal is None else legal
             return *choose(self.space, logits, observations, None, rng, legal), memory
 
         return decide

@@ -109,10 +109,11 @@ def test_wire_is_spread_evenly_over_a_nets_box() -> None:
 
 
 def test_straight_wires_run_through_one_bins_width() -> None:
-    one = Netlist("one", ("a",), np.array([[2.0, 2.0]]), ((Pin(0, 0, 0), Pin(BOARD, 8, 3)),))
+    one = Netlist("one", ("a",), np.array([[2.0, 2.0]]), ((Pin(0, 0, -0.5), Pin(BOARD, 8, 2.5)),))
     chip = Chip(one, 8.0, 8.0, grid=4, bins=4)
-    demand = chip.demand(chip.boxes(np.array([[1 * 4 + 1]])))[0]  # from (3, 3) to (8, 3)
-    np.testing.assert_allclose(demand.sum(1), [0.0, 2.5, 0.0, 0.0])
+    demand = chip.demand(chip.boxes(np.array([[1 * 4 + 1]])))[0]  # from (3, 2.5) to (8, 2.5)
+    # Of two units of width, half a unit is in the lowest bins.
+    np.testing.assert_allclose(demand.sum(1), [0.25 * 2.5, 0.75 * 2.5, 0.0, 0.0])
 
 
 def test_a_macro_larger_than_the_chip_is_refused() -> None:
