@@ -71,6 +71,7 @@ class Settings(BaseModel):
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {
         "control": "prefrl.envs.control:ControlSettings",
+        "floorplan": "prefrl.envs.floorplan:FloorplanSettings",
         "fork": "prefrl.envs.toys:ForkSettings",
         "gridworld": "prefrl.envs.tabular:GridworldSettings",
         "imdb": "prefrl.envs.imdb:IMDBSettings",

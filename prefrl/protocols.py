@@ -196,6 +196,21 @@ class Recorded(Protocol):
 
 
 @runtime_checkable
+class Mapped(ControlTask, Protocol):
+    """A task of discrete actions, of each of which something can be told before it is taken."""
+
+    @property
+    def maps(self) -> Sequence[str]:
+        """The names of the F numbers that are told."""
+
+    def told(self, observations: Floats) -> Floats:
+        """(n, O) observations -> (n, A, F) float32, of the order of 1."""
+
+    def legal(self, observations: Floats) -> Bools:
+        """(n, O) -> (n, A): which actions there were."""
+
+
+@runtime_checkable
 class NamesActions(Protocol):
     """A task of control that has words for what can be done."""
 

@@ -26,7 +26,7 @@ from prefrl.types import Floats
 STEPS = 200
 """Newton steps before giving up; a convex loss takes about ten."""
 Loss = Callable[[Tensor], Tensor]
-OWN = ("inputs", "quadratic")
+OWN = ("inputs", "observations", "quadratic")
 """Features that need no other package."""
 
 
@@ -38,7 +38,8 @@ class LinearSettings(Settings):
     """E: draws from the posterior, in pairs around its mode; where E is odd, one is the mode itself."""
     features: str = "inputs"
     """A step's observation and action, standardised (`inputs`); these, their squares less 1, and their products
-    (`quadratic`); or hand-made features, by their name in the entry-point group `prefrl.features`."""
+    (`quadratic`); its observation alone (`observations`), where there are many actions and what they do is seen a step
+    later; or hand-made features, by their name in the entry-point group `prefrl.features`."""
     prior_std: float = Field(10.0, gt=0)
     """The prior's spread of a weight: by how many logits one standard deviation of a feature, kept up over a segment
     of the usual length, makes it better."""
@@ -53,6 +54,8 @@ class LinearSettings(Settings):
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
 
     def _hand_made(self) -> Describe | None:
+        if self.features == "observations":
+            return lambda observations, actions: observations
         if self.features in OWN:
             return None
         installed = feature_functions()

@@ -27,11 +27,12 @@ from prefrl.improve.objectives import Objective
 from prefrl.improve.player import NO_ZIP, Player
 from prefrl.improve.shown import Imitation, ImitationSettings
 from prefrl.improve.valued import Turn, valued
-from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, forgotten
+from prefrl.policies.acting import Acting, Actor, ControlPolicy, Decide, Memory, allowed, forgotten
 from prefrl.policies.cnn import CNNPolicySettings
 from prefrl.policies.divided import environments, of_all
 from prefrl.policies.flow import NEITHER, FlowPolicy, FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
+from prefrl.policies.maps import MapsPolicySettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.origin import starting_state
 from prefrl.policies.rollout import collect, joined, learned_rewards, step_rewards
@@ -59,7 +60,12 @@ def _of_some_kind(given: Any) -> Any:
 
 
 PolicySettings: TypeAlias = Annotated[
-    MLPPolicySettings | CNNPolicySettings | GRUPolicySettings | TransformerPolicySettings | FlowPolicySettings,
+    MLPPolicySettings
+    | CNNPolicySettings
+    | GRUPolicySettings
+    | TransformerPolicySettings
+    | FlowPolicySettings
+    | MapsPolicySettings,
     Field(discriminator="kind"),
     BeforeValidator(_of_some_kind),
 ]
@@ -305,7 +311,7 @@ class ControlLearner:
         decide = self._decide()
 
         def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
-            _, actions, memory = decide(observations, rng, None, memory)
+            _, actions, memory = decide(observations, rng, allowed(self._task, observations), memory)
             return actions, memory
 
         return act

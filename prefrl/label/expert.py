@@ -22,7 +22,7 @@ from prefrl.policies.origin import actor_of
 from prefrl.policies.rollout import whole_episodes
 from prefrl.protocols import ControlTask, Store, Task, simulated
 from prefrl.sample.segments import placed, segment
-from prefrl.types import Bools, Floats, Query, Segment
+from prefrl.types import Bools, Floats, Integers, Query, Segment
 
 Advice: TypeAlias = Callable[[Floats], Floats]
 """Observations (n, O) -> the expert's actions (n, A), within the bounds, or one-hot."""
@@ -145,7 +145,7 @@ def play(
         if moods is not None:
             mood[begins] = noise.random(int(begins.sum()))
         clean = advice(observations) if moods is None else moods(observations, mood)
-        return clean, _disturbed(clean, task, settings.noise, noise)
+        return clean, _disturbed(clean, task, settings.noise, noise, legal)
 
     rollout = whole_episodes(task, act, episodes, rng)
     shown = replace(rollout, actions=rollout.choices)
@@ -154,15 +154,24 @@ def play(
     return placed(task, [segment(shown, i, 0, int(lengths[i]), settings.name) for i in range(episodes)])
 
 
-def _disturbed(actions: Floats, task: ControlTask, width: float, rng: np.random.Generator) -> Floats:
+def _disturbed(
+    actions: Floats, task: ControlTask, width: float, rng: np.random.Generator, legal: Bools | None
+) -> Floats:
     if not width:
         return actions
     if task.action_bounds is None:
-        drawn = np.eye(task.action_size, dtype=np.float32)[rng.integers(task.action_size, size=len(actions))]
+        among = rng.integers(task.action_size, size=len(actions)) if legal is None else _one_of(legal, rng)
+        drawn = np.eye(task.action_size, dtype=np.float32)[among]
         return np.where(rng.random((len(actions), 1)) < width, drawn, actions)
     low, high = task.action_bounds
     bounded = np.isfinite(low) & np.isfinite(high)
     half = np.where(bounded, (np.where(bounded, high, 1) - np.where(bounded, low, -1)) / 2, 1)  # what has no bounds: 1
     noisy = actions + width * half * rng.standard_normal(actions.shape)
     found: Floats = np.clip(noisy, low, high).astype(np.float32)
+    return found
+
+
+def _one_of(legal: Bools, rng: np.random.Generator) -> Integers:
+    """(n, A) -> (n,): one that there is, each as probable."""
+    found: Integers = (rng.random(legal.shape) * legal).argmax(1)
     return found

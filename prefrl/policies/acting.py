@@ -18,7 +18,7 @@ from torch import Tensor
 
 from prefrl.policies.normaliser import Normaliser
 from prefrl.policies.rollout import Rollout
-from prefrl.protocols import I, Policy
+from prefrl.protocols import ControlTask, I, Mapped, Policy
 from prefrl.seeding import to_numpy
 from prefrl.types import Bools, Floats, Segment, State
 
@@ -127,6 +127,11 @@ def played(actor: Actor, rng: np.random.Generator | None) -> Acting:
     return Acting(decide, rng)
 
 
+def allowed(task: ControlTask, observations: Floats) -> Bools | None:
+    """(n, A): which actions there are, where a task's observations (n, O) say so; for those who act without it."""
+    return task.legal(observations) if isinstance(task, Mapped) else None
+
+
 def forgotten(memory: Memory, begins: Bools) -> Memory:
     """The same, without what belongs to other episodes than those that begin (n,)."""
     return memory if memory is None else np.where(begins[:, None], np.float32(0), memory)
@@ -201,6 +206,7 @@ __all__ = [
     "Decisions",
     "Memory",
     "Reading",
+    "allowed",
     "copy_into",
     "forgotten",
     "in_chunks",

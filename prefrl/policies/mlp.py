@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
@@ -29,7 +29,7 @@ from prefrl.policies.heads import (
 from prefrl.policies.normaliser import Normaliser, Scaling
 from prefrl.policies.perceptron import Activation, Layers, activated, backward, forward
 from prefrl.policies.rollout import Rollout
-from prefrl.protocols import ControlTask, PassByHand
+from prefrl.protocols import ControlTask, Mapped, PassByHand
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, Segment, State
 
@@ -59,12 +59,16 @@ class NumpyActor:
     noise: Noise | None
     """None where actions are discrete."""
     scaling: Scaling
+    legal: Callable[[Floats], Bools] | None = None
+    """(n, O) -> (n, A): which actions there are, where observations say so and nobody else does."""
 
     def __call__(
         self, observations: Floats, rng: np.random.Generator | None, legal: Bools | None = None
     ) -> tuple[Floats, Floats]:
         """(n, O) -> choices (n, A) and actions to execute (n, A), as `choose` does."""
         outputs, trace = forward(self.scaling(observations), self.layers, self.activation)
+        if legal is None and self.legal is not None:
+            legal = self.legal(observations)
         return choose(self.space, outputs, trace.inputs[-1], self.noise, rng, legal)
 
 
@@ -94,6 +98,7 @@ class MLPPolicy:
     ) -> None:
         """`learns_std`: false where the standard deviation stays what it is at first."""
         self._learns_std = learns_std
+        self._legal = task.legal if isinstance(task, Mapped) else None
         self.settings, self.space = settings, ActionSpace.of(task, settings)
         size, order = task.observation_size, generator(rng)
         of_critic = settings.hidden if settings.critic_hidden is None else settings.critic_hidden
@@ -147,7 +152,8 @@ class MLPPolicy:
         """What acts as the policy does now; it is not to be kept while the policy learns."""
         weights = self._views(self._flat)
         noise = None if weights.log_std is None else Noise(weights.log_std, self.settings.sde_steps)
-        return NumpyActor(self.space, weights.actor, self.settings.activation, noise, self.normaliser.now())
+        parts = self.space, weights.actor, self.settings.activation, noise, self.normaliser.now()
+        return NumpyActor(*parts, self._legal)
 
     def decide(self) -> Decide:
         actor = self.numpy_actor()
@@ -188,9 +194,10 @@ class MLPPolicy:
         return 0.0 if self._learns_std else self.peak
 
     def examples(self, segments: Sequence[Segment]) -> Decisions:
-        observations = self.normalise(np.concatenate([one.observations for one in segments]))
+        seen = np.concatenate([one.observations for one in segments])
         choices = self.space.choices(np.concatenate([one.actions for one in segments]))
-        return Decisions(*(torch.from_numpy(x).to(self.device) for x in (observations, choices)))
+        arrays = [self.normalise(seen), choices, *([] if self._legal is None else [self._legal(seen)])]
+        return Decisions(*(torch.from_numpy(x).to(self.device) for x in arrays))
 
     def redrawn(self, examples: Decisions, rng: np.random.Generator) -> Decisions:
         """Nothing was drawn for them."""

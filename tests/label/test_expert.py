@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from corridor import corridor
 
 from prefrl.components import ConfigError
 from prefrl.config import Config
@@ -121,11 +122,20 @@ def test_noise_is_as_wide_as_was_said(discrete: bool) -> None:
     name = "CartPole-v1" if discrete else "Pendulum-v1"
     task = cast("ControlTask", ControlSettings.model_validate({"env": name}).build())
     clean = np.tile(np.eye(2, dtype=np.float32)[:1], (40_000, 1)) if discrete else np.zeros((40_000, 1), np.float32)
-    noisy = _disturbed(clean, task, 0.25, np.random.default_rng(0))
+    noisy = _disturbed(clean, task, 0.25, np.random.default_rng(0), None)
     if discrete:  # of a quarter that is drawn anew, half comes out as it was
         assert (noisy != clean).any(1).mean() == pytest.approx(0.125, abs=0.01)
     else:
         assert noisy.std() == pytest.approx(0.25 * 2.0, rel=0.02)
+
+
+def test_noise_keeps_to_what_is_legal() -> None:
+    legal = np.array([[True, False, True], [False, True, False]]).repeat(2_000, 0)
+    clean = np.eye(3, dtype=np.float32)[legal.argmax(1)]
+    noisy = _disturbed(clean, corridor(), 1.0, np.random.default_rng(0), legal)
+    assert not noisy[~legal].any()
+    assert noisy.sum(1).tolist() == [1.0] * 4_000
+    assert noisy[:2_000].mean(0) == pytest.approx([0.5, 0.0, 0.5], abs=0.05)
 
 
 def test_noise_of_discrete_actions_is_a_share() -> None:

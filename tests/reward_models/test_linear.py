@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -187,6 +188,15 @@ def test_hand_made_features_take_the_place_of_the_inputs(monkeypatch: pytest.Mon
     rewards = model.rewards(fresh[0].observations[None], fresh[0].actions[None])
     np.testing.assert_allclose(rewards.sum(), model.score(fresh[:1])[0], rtol=1e-4)
     assert _network(model).named()["weight"].shape == (8, 2, 1)
+
+
+def test_of_observations_alone_it_sees_no_action() -> None:
+    model = _model(features="observations")
+    segments, _ = _fit(model, 100)
+    others = [replace(one, actions=one.actions + 1.0) for one in segments]
+    np.testing.assert_array_equal(model.score(segments), model.score(others))
+    assert np.corrcoef(model.score(segments), _means(segments)[:, :3] @ PLANTED[:3])[0, 1] > 0.9
+    assert _network(model).named()["weight"].shape == (8, 3, 1)
 
 
 def test_features_that_are_not_there_or_not_of_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
