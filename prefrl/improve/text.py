@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -22,17 +21,14 @@ from torch import Tensor
 from prefrl.components import Settings, filled_in
 from prefrl.evaluate.policies import scored
 from prefrl.improve.gradient import Batch, update
+from prefrl.improve.groups import ADVANTAGES, AVERAGES, advantages_of, mean
 from prefrl.improve.objectives import (
     AdaptiveKL,
     Objective,
     Reduction,
     all_equal,
-    batch_centred,
-    batch_scaled,
-    group_normalised,
     kl_k1,
     kl_k3,
-    leave_one_out,
     masked_mean,
     masked_whiten,
     step_rewards,
@@ -233,7 +229,7 @@ class TextLearner:
             self._move_reference()
             if self._settings.kl_stop is not None and measured["kl"] > self._settings.kl_stop:
                 break
-        means = {name: _mean(values) for name, values in seen.items()}
+        means = {name: mean(values) for name, values in seen.items()}
         return means | {"ratio_error": max(seen["ratio_error"]), "updates": float(len(seen["ratio_error"]))}
 
     def check_reward(self, reward: RewardModel[Response]) -> None:
@@ -393,30 +389,6 @@ class TextLearner:
                 "expected finite numbers: look at the reward model's last fit"
             )
         return values
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Of the batches in which it is defined."""
-    known = [value for value in values if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
-
-
-def advantages_of(returns: Tensor, how: str) -> Tensor:
-    """(P, K) returns of K responses to each of P prompts -> (P, K) advantages."""
-    if how == "leave_one_out":
-        return leave_one_out(returns)
-    scaled = {"group_normalised": group_normalised, "batch_scaled": batch_scaled, "batch_mean": batch_centred}
-    return scaled[how](returns)
-
-
-AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
-ADVANTAGES = {
-    "leave_one_out": "R_i - mean of the prompt's other R_j",
-    "group_normalised": "(R_i - mean of the prompt's R_j) / (their std + 1e-4)",
-    "batch_scaled": "(R_i - mean of the prompt's R_j) / (std of the batch's R + 1e-4)",
-    "batch_mean": "R_i - mean of the batch's R_j",
-}
-"""Of a response."""
 
 
 def text_formula(settings: TextLearnerSettings) -> str:

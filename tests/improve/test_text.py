@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
+from prefrl.improve.groups import advantages_of
+from prefrl.improve.text import TextLearner, TextLearnerSettings, text_formula
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
