@@ -332,13 +332,6 @@ def test_an_evaluation_is_over_what_was_scored(toy_reviews: Reviews) -> None:
     assert (found["learned"], found["unscored"]) == (2.0, 0.25)
 
 
-def test_the_kl_does_not_teach_by_what_was_not_scored(toy_reviews: Reviews) -> None:
-    """However far such a response is from the start: it has no advantage, and is in no baseline."""
-    one = learner(toy_reviews, algorithm="grpo")
-    kls = torch.tensor([[0.0, 0.0, 0.0, math.nan]])
-    assert torch.equal(torch.as_tensor(one._kl_advantages(kls)), torch.zeros(1, 4))
-
-
 def test_a_kl_off_each_token_is_that_of_it_and_what_follows(toy_reviews: Reviews) -> None:
     one = learner(toy_reviews, kl_in="token", beta=0.5, prompts=1, responses=3)
     rows = one.policy.respond(["The plot was"], 3, np.random.default_rng(0))
