@@ -71,6 +71,7 @@ class Settings(BaseModel):
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {
         "control": "prefrl.envs.control:ControlSettings",
+        "digits": "prefrl.envs.digits:DigitsSettings",
         "fork": "prefrl.envs.toys:ForkSettings",
         "gridworld": "prefrl.envs.tabular:GridworldSettings",
         "imdb": "prefrl.envs.imdb:IMDBSettings",
@@ -99,6 +100,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "linear": "prefrl.reward_models.linear:LinearSettings",
         "transformer": "prefrl.reward_models.text:TransformerSettings",
         "functions": "prefrl.reward_models.functions:FunctionsSettings",
+        "pictures": "prefrl.reward_models.pictures:PictureRewardSettings",
     },
     "learners": {
         "clone": "prefrl.improve.clone:CloneSettings",
@@ -108,6 +110,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
+        "pictures": "prefrl.improve.pictures:PictureLearnerSettings",
         "q_learning": "prefrl.improve.q_learning:QLearningSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
@@ -136,7 +139,7 @@ EXTRAS = {
     "datasets": "text",
     "peft": "text",
     "vaderSentiment": "text",
-    "sklearn": "imdb",
+    "sklearn": "pictures",
     "av": "label",
     "fastapi": "label",
     "starlette": "label",

@@ -1,4 +1,4 @@
-"""The kinds of candidate, and a fourth one that no file of the product names: it goes through the house all the same."""
+"""The kinds of candidate, and a fourth that no file of the product names: it goes through the house all the same."""
 
 from __future__ import annotations
 
