@@ -84,6 +84,8 @@ class Kind(Generic[C]):
     # --- shown ---
     shows: Literal["clip", "text"] = "text"
     """A clip is drawn by the task, and text is there already."""
+    still: bool = False
+    """Whether its clips are single pictures, which need no player."""
     shown: Callable[[Fields], Shown] = lambda _: Shown()
     """From its description."""
     question: str = "Which is better?"
@@ -298,6 +300,7 @@ PICTURES = Kind(
     pipelines=("image-classification", "text-to-image"),
     drifts=True,
     shows="clip",
+    still=True,
     shown=lambda body: Shown(prompt=body["caption"], steps=1),
     question="Which picture fits its caption better?",
     hints=(
