@@ -106,6 +106,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "clone": "prefrl.improve.clone:CloneSettings",
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "cpl": "prefrl.improve.cpl:CPLSettings",
+        "diffusion_dpo": "prefrl.improve.diffusion_dpo:DiffusionDPOSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
