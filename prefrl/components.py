@@ -90,6 +90,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",
         "terminal": "prefrl.label.terminal:TerminalSettings",
+        "vision_judge": "prefrl.label.vision_judge:VisionJudgeSettings",
         "web": "prefrl.label.web:WebSettings",
     },
     "rewards": {
