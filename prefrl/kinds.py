@@ -302,6 +302,7 @@ PICTURES = Kind(
     shows="clip",
     still=True,
     shown=lambda body: Shown(prompt=body["caption"], steps=1),
+    exports={"bundle": "", "pick-a-pic": ".parquet"},
     question="Which picture fits its caption better?",
     hints=(
         "Read the caption, then look at each picture as a whole. Small pictures are shown enlarged.",
