@@ -172,6 +172,7 @@ def round_line(round: Round) -> Text:
         ("fit/accuracy_held_out", "accuracy", ".2f"),
         ("evaluate/kl", "kl", ".2f"),
         ("evaluate/fluency", "fluency", ".2f"),
+        ("evaluate/spread", "spread", ".2f"),
         ("label/answered", "labels", ".0f"),
         ("steps/learn", "steps", ",.0f"),
     ):
@@ -191,7 +192,8 @@ def summary_table(summary: Fields) -> Table:
     table.add_row("reward accuracy, held out", number(summary["reward_accuracy"]))
     if (kind := find(summary["kind"])) and kind.drifts:
         table.add_row("kl to the start, nats", number(summary["kl"]))
-        table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
+        if summary["fluency_before"] is not None:
+            table.add_row("fluency", f"{number(summary['fluency_before'])} → {number(summary['fluency_after'])}")
     for name in ("labels", "steps"):
         table.add_row(name, ", ".join(f"{k} {v:,}" for k, v in summary[name].items()))
     table.add_row("time", ", ".join(f"{k} {duration(v)}" for k, v in summary["seconds"].items()))

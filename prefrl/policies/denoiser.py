@@ -39,6 +39,8 @@ class Denoiser(torch.nn.Module):
 
     def __init__(self, pixels: int, captions: int, steps: int, width: int, layers: int) -> None:
         super().__init__()
+        self.signal: Tensor
+        """(T + 1,): the share of a picture's variance that is left at each level (alpha-bar)."""
         self.enter, self.leave = torch.nn.Linear(pixels, width), torch.nn.Linear(width, pixels)
         self.levels, self.captions = torch.nn.Embedding(steps + 1, width), torch.nn.Embedding(captions, width)
         self.layers = torch.nn.ModuleList(_Layer(width) for _ in range(layers))
@@ -69,7 +71,7 @@ class Denoiser(torch.nn.Module):
 
     def mixture(self, level: Tensor) -> tuple[Tensor, Tensor]:
         """a and b (R, 1): how much of the picture and of the noise there is at levels (R,)."""
-        signal = cast(Tensor, self.signal)[level, None]
+        signal = self.signal[level, None]
         return signal.sqrt(), (1 - signal).sqrt()
 
 
@@ -150,7 +152,7 @@ class DenoiserPolicy:
         self.task, self.part = task, settings.chunk
         self.model, self.start = (cast(Denoiser, task.denoiser()) for _ in range(2))
         self.start.requires_grad_(False)
-        self._steps = _steps_of(cast(Tensor, self.model.signal))
+        self._steps = _steps_of(self.model.signal)
 
     @property
     def device(self) -> torch.device:
@@ -160,7 +162,7 @@ class DenoiserPolicy:
         """Move everything to a device, for good."""
         for model in (self.model, self.start):
             model.to(device)
-        self._steps = _steps_of(cast(Tensor, self.model.signal))
+        self._steps = _steps_of(self.model.signal)
 
     def parameters(self) -> list[torch.nn.Parameter]:
         return list(self.model.parameters())

@@ -172,16 +172,16 @@ def test_a_server_that_fails_once_is_asked_again(task: Digits, server: Server, t
 
 
 def test_a_server_that_cannot_be_used_is_told(task: Digits, server: Server, tmp_path: Path) -> None:
-    query = pairs(1)[0].candidates
+    first, second = pairs(1)[0].candidates
     server.reply = lambda _: (401, "no such key")
     with pytest.raises(ConfigError, match="the server refuses with 401: no such key"):
-        judge(task, server).compare([query])
+        judge(task, server).compare([(first, second)])
     server.reply = lambda _: (200, "<html>")
     with pytest.raises(ConfigError, match="does not speak JSON"):
-        judge(task, server).compare([query])
+        judge(task, server).compare([(first, second)])
     nobody = VisionJudgeSettings(address="http://127.0.0.1:9/v1").build(task)
     with pytest.raises(ConfigError, match=r"nobody answers at http://127.0.0.1:9/v1"):
-        nobody.compare([query])
+        nobody.compare([(first, second)])
     with pytest.raises(ConfigError, match="key_file: cannot be read"):
         judge(task, server, key_file=tmp_path / "none")
 
@@ -189,14 +189,15 @@ def test_a_server_that_cannot_be_used_is_told(task: Digits, server: Server, tmp_
 def test_a_key_is_read_from_its_file_and_never_kept(task: Digits, server: Server, tmp_path: Path) -> None:
     (tmp_path / "key").write_text("secret\n")
     one = judge(task, server, key_file=tmp_path / "key")
-    one.compare([pairs(1)[0].candidates])
+    first, second = pairs(1)[0].candidates
+    one.compare([(first, second)])
     assert set(server.keys) == {"Bearer secret"}
     assert "secret" not in repr(one) + one.settings.model_dump_json()
 
 
 def test_what_a_reply_says() -> None:
-    said = [{"choices": [{"message": {"content": word}}]} for word in ("A", "**B**", "Both", '"A".', 7)]
-    found = [read_reply(one, ("A", "B")) for one in (*said, {}, [], None)]
+    said: list[object] = [{"choices": [{"message": {"content": word}}]} for word in ("A", "**B**", "Both", '"A".', 7)]
+    found = [read_reply(one, ("A", "B")) for one in [*said, {}, [], None]]
     assert found[:2] == [1.0, 0.0]
     assert found[3] == 1.0
     assert all(np.isnan(x) for x in (found[2], *found[4:]))

@@ -48,7 +48,7 @@ def test_a_step_is_a_gaussian_whose_probability_and_kl_are_exact(policy: Denoise
     assert logp.shape == kl.shape == chains.mask.shape == (20, policy.model.steps - 1)
     for at, level in enumerate(range(policy.model.steps, 1, -1)):
         ours, start = (steps_by_hand(model, chains, level) for model in (policy.model, policy.start))
-        expected = ours.log_prob(chains.states[:, at + 1].double()).sum(1)
+        expected = ours.log_prob(chains.states[:, at + 1].double()).sum(1)  # type: ignore[no-untyped-call]
         torch.testing.assert_close(logp[:, at].double(), expected, atol=1e-3, rtol=1e-4)
         torch.testing.assert_close(kl[:, at].double(), kl_divergence(ours, start).sum(1), atol=1e-3, rtol=1e-3)
     assert kl.min() > 0.01
@@ -67,7 +67,7 @@ def test_a_chain_has_the_probability_that_it_was_drawn_with_to_the_bit(policy: D
     """However many go through the network beside it: the ratio is exactly 1 before the first step."""
     chains = drawn(policy, count)
     assert torch.equal(policy.log_prob(chains)[0], chains.logp)
-    for at in torch.randperm(count).split(7):
+    for at in torch.randperm(count).split(7):  # type: ignore[no-untyped-call]
         assert torch.equal(policy.log_prob(chains.rows(at))[0], chains.logp[at])
 
 
@@ -103,12 +103,8 @@ def test_the_last_step_stays_the_starting_policys(policy: DenoiserPolicy) -> Non
     assert torch.equal(chains.pixels.flatten(1), expected)
 
 
-def test_a_state_goes_through_a_checkpoint_and_another_size_is_refused(
-    policy: DenoiserPolicy, tmp_path: object
-) -> None:
-
-    folder = Path(str(tmp_path))
-    save_state(folder, "policy", policy.state())
+def test_a_state_goes_through_a_checkpoint_and_another_size_is_refused(policy: DenoiserPolicy, tmp_path: Path) -> None:
+    save_state(tmp_path, "policy", policy.state())
     other = policy_of(small_digits("a three", "an eight"))
     other.load(load_state(tmp_path, "policy"))
     assert torch.equal(drawn(other).pixels, drawn(policy).pixels)
