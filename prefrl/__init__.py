@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from prefrl.judgements import Skip as Skip
     from prefrl.rundir import Run as Run
     from prefrl.stages import load_policy as load_policy
+    from prefrl.types import Picture as Picture
     from prefrl.types import Query as Query
     from prefrl.types import Response as Response
     from prefrl.types import Segment as Segment
@@ -23,6 +24,7 @@ __all__ = [
     "Choice",
     "Comparison",
     "Config",
+    "Picture",
     "Query",
     "Ranking",
     "Rating",

@@ -71,6 +71,7 @@ class Settings(BaseModel):
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {
         "control": "prefrl.envs.control:ControlSettings",
+        "digits": "prefrl.envs.digits:DigitsSettings",
         "floorplan": "prefrl.envs.floorplan:FloorplanSettings",
         "fork": "prefrl.envs.toys:ForkSettings",
         "gridworld": "prefrl.envs.tabular:GridworldSettings",
@@ -90,6 +91,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",
         "terminal": "prefrl.label.terminal:TerminalSettings",
+        "vision_judge": "prefrl.label.vision_judge:VisionJudgeSettings",
         "web": "prefrl.label.web:WebSettings",
     },
     "rewards": {
@@ -100,15 +102,18 @@ TABLE: dict[Role, dict[str, str]] = {
         "linear": "prefrl.reward_models.linear:LinearSettings",
         "transformer": "prefrl.reward_models.text:TransformerSettings",
         "functions": "prefrl.reward_models.functions:FunctionsSettings",
+        "pictures": "prefrl.reward_models.pictures:PictureRewardSettings",
     },
     "learners": {
         "clone": "prefrl.improve.clone:CloneSettings",
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "cpl": "prefrl.improve.cpl:CPLSettings",
+        "diffusion_dpo": "prefrl.improve.diffusion_dpo:DiffusionDPOSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
+        "pictures": "prefrl.improve.pictures:PictureLearnerSettings",
         "q_learning": "prefrl.improve.q_learning:QLearningSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",
@@ -137,7 +142,7 @@ EXTRAS = {
     "datasets": "text",
     "peft": "text",
     "vaderSentiment": "text",
-    "sklearn": "imdb",
+    "sklearn": "pictures",
     "av": "label",
     "fastapi": "label",
     "starlette": "label",

@@ -1,6 +1,6 @@
 """The kinds of candidate: one row for each says how it is named, stored, measured, cut, shown and checked.
 
-Code that must know how a candidate of any kind is written or shown asks its row. A third kind is a row more: here, or
+Code that must know how a candidate of any kind is written or shown asks its row. A fourth kind is a row more: here, or
 in an installed package, through the entry-point group `prefrl.kinds`.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from prefrl.components import suggest
-from prefrl.types import LARGEST, C, Candidate, Fields, Json, Response, Segment, is_whole
+from prefrl.types import LARGEST, C, Candidate, Fields, Json, Picture, Response, Segment, is_whole
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
@@ -84,6 +84,8 @@ class Kind(Generic[C]):
     # --- shown ---
     shows: Literal["clip", "text"] = "text"
     """A clip is drawn by the task, and text is there already."""
+    still: bool = False
+    """Whether its clips are single pictures, which need no player."""
     shown: Callable[[Fields], Shown] = lambda _: Shown()
     """From its description."""
     question: str = "Which is better?"
@@ -262,6 +264,57 @@ RESPONSES = Kind(
 )
 
 
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+
+def _picture_fault(one: Picture) -> str:
+    if not _are_text(one.caption):
+        return f"is not described as it is: its caption is {one.caption!r:.40}; expected text"
+    if one.pixels.dtype != np.uint8:
+        return f"has pixels of type {one.pixels.dtype}; expected bytes (uint8)"
+    grey, colour = one.pixels.ndim == 2, one.pixels.ndim == 3 and one.pixels.shape[-1] == 3
+    if not (grey or colour) or not one.pixels.size:
+        return f"has pixels of shape {one.pixels.shape}; expected (H, W), or (H, W, 3)"
+    return ""
+
+
+def _picture_misfit(one: Picture, task: Any) -> str:
+    if one.pixels.shape != task.shape:
+        return f"has pixels of shape {one.pixels.shape}, but {task.name} has {task.shape}"
+    known = one.caption in task.captions
+    return "" if known else f"has the caption {one.caption!r:.40}; {suggest(one.caption, task.captions)}"
+
+
+PICTURES = Kind(
+    name="pictures",
+    candidate=Picture,
+    noun="picture",
+    describe=lambda one: {"caption": one.caption},
+    load=lambda body, read: Picture(body["caption"], read()["pixels"]),
+    arrays=lambda one: {"pixels": one.pixels},
+    fault=_picture_fault,
+    plain=lambda one: replace(one, gold=None),
+    misfit=_picture_misfit,
+    length=lambda one: one.pixels.size,
+    unit=lambda _: "pixels",
+    pipelines=("image-classification", "text-to-image"),
+    drifts=True,
+    shows="clip",
+    still=True,
+    shown=lambda body: Shown(prompt=body["caption"], steps=1),
+    exports={"bundle": "", "pick-a-pic": ".parquet"},
+    question="Which picture fits its caption better?",
+    hints=(
+        "Read the caption, then look at each picture as a whole. Small pictures are shown enlarged.",
+        "Judge how well a picture fits the caption, not how tidy it is, unless the caption asks for that.",
+    ),
+    start="caption",
+    behaviour="picture",
+    step="picture",
+    spent="picture",
+)
+
+
 # --- looked up ------------------------------------------------------------------------------------------------------
 
 
@@ -273,7 +326,7 @@ def plugins() -> tuple[Kind[Any], ...]:
 
 def kinds() -> Iterator[Kind[Any]]:
     """All of them; what packages bring is loaded only when none of our own will do."""
-    yield from (SEGMENTS, RESPONSES)
+    yield from (SEGMENTS, RESPONSES, PICTURES)
     yield from plugins()
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from prefrl.components import ConfigError
 from prefrl.judgements import Answer, Demonstrated, Judged
-from prefrl.kinds import RESPONSES, SEGMENTS
+from prefrl.kinds import PICTURES, RESPONSES, SEGMENTS
 from prefrl.seeding import Device
 from prefrl.types import (
     Bools,
@@ -25,6 +25,7 @@ from prefrl.types import (
     Floats,
     Integers,
     Metrics,
+    Picture,
     Query,
     Response,
     Segment,
@@ -263,6 +264,27 @@ class Authored(TextTask, Protocol):
         """So many responses, each to a prompt of its own, of those to learn; without gold."""
 
 
+class PictureTask(DrawnTask[Picture], Protocol):
+    """Captions to be drawn for by a small denoiser."""
+
+    @property
+    def captions(self) -> Sequence[str]:
+        """All that may be asked for."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W), or (H, W, 3)."""
+
+    def denoiser(self) -> torch.nn.Module:
+        """The starting policy, a copy of its own: a `prefrl.policies.denoiser.Denoiser`."""
+
+    def gold(self, pictures: Sequence[Picture]) -> Floats:
+        """(N,) the hidden value of each picture, or NaN where the task has none."""
+
+    def spread(self, pictures: Sequence[Picture]) -> float:
+        """How much pictures of one caption differ, as a share of how much real ones do; NaN for fewer than two."""
+
+
 def control(task: Task, what: str) -> ControlTask:
     """A task, known to be of control. Raises `ConfigError` for others; `what` says who needs it and for what."""
     if task.kind != SEGMENTS.name:
@@ -286,6 +308,13 @@ def text(task: Task, what: str) -> TextTask:
     if task.kind != RESPONSES.name:
         raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
     return cast(TextTask, task)
+
+
+def pictures(task: Task, what: str) -> PictureTask:
+    """A task of pictures, as `control` is for its own."""
+    if task.kind != PICTURES.name:
+        raise ConfigError(f"{what}, but the task is of kind {task.kind!r}")
+    return cast(PictureTask, task)
 
 
 class Labeler(Protocol[C]):
@@ -519,6 +548,14 @@ class Policy(Protocol[I_contra]):
         """Both, in one pass where the critic shares the network."""
 
 
+@runtime_checkable
+class Anchored(Policy[I_contra], Protocol[I_contra]):
+    """A policy that knows the exact KL of each step to the policy that it started from."""
+
+    def log_prob_and_kl(self, inputs: I_contra) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, L) log-probabilities, and the KL of each step in nats given what came before it; differentiable."""
+
+
 class PassByHand(NamedTuple):
     """A forward pass over B sequences of one step each, in NumPy, and the way back."""
 
@@ -692,6 +729,7 @@ __all__ = [
     "LearnerSettings",
     "Parted",
     "Particular",
+    "PictureTask",
     "Policy",
     "Recorded",
     "RewardModel",

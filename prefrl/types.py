@@ -115,6 +115,27 @@ class Response:
         return digest(f"{self.prompt}\0{self.text}", tokens)
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What was drawn for a caption."""
+
+    caption: str
+    pixels: npt.NDArray[np.uint8]
+    """(H, W) grey, or (H, W, 3) colour: 0 is black."""
+    gold: Floats | None = None
+    """(1,) the task's own score. Hidden, as in `Segment`."""
+
+    @property
+    def context(self) -> str:
+        """Only pictures of one caption may be compared."""
+        return self.caption
+
+    @cached_property
+    def id(self) -> str:
+        """sha256 over caption and pixels. The gold is not part of it."""
+        return digest(self.caption, {"pixels": self.pixels})
+
+
 def gold_score(candidate: Candidate) -> float:
     """The gold of a whole candidate: the sum over its steps. For oracles and evaluation only."""
     if candidate.gold is None:

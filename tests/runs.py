@@ -27,6 +27,11 @@ TINY = {
     "text/toy": (
         "loop.labels=8", "learner.updates=1", "learner.evaluation_prompts=4", "fitting.epochs=1",
     ),
+    "pictures/digits": (
+        "task.denoiser.steps=4", "task.denoiser.width=32", "task.denoiser.layers=1", "task.denoiser.batches=300",
+        "loop.rounds=2", "loop.labels=16", "learner.updates=1", "learner.pictures=16", "learner.evaluation_pictures=8",
+        "fitting.epochs=2",
+    ),
 }  # fmt: skip
 """Enough of each toy preset that every stage has something to do in every round, and no more."""
 

@@ -54,7 +54,7 @@ def workshop(demo: Path, tmp_path: Path) -> Path:
 
 def sped(line: str) -> str:
     """A command that runs a toy preset on its own task, with what it leaves open set as low as it can be."""
-    found = re.search(r"prefrl .*?\b(run|label|improve) (control/toy|text/toy)\b", line)
+    found = re.search(r"prefrl .*?\b(run|label|improve) (control/toy|text/toy|pictures/digits)\b", line)
     if found is None or "task." in line:
         return line
     taken = ("learner." if "learner.kind" in line else "", *re.findall(r"[\w.]+(?==)", line))

@@ -60,10 +60,10 @@ def test_few_files_lie_flat_at_the_root_of_the_package() -> None:
 
 # --- kinds ------------------------------------------------------------------------------------------------------------
 
-ROWS = {"SEGMENTS", "RESPONSES"}
+ROWS = {"SEGMENTS", "RESPONSES", "PICTURES"}
 """In the table of `prefrl.kinds`."""
-CANDIDATES = {"Segment", "Response", *ROWS}
-NAMES = {"control", "text", "segment", "response"}
+CANDIDATES = {"Segment", "Response", "Picture", *ROWS}
+NAMES = {"control", "text", "pictures", "segment", "response", "picture"}
 """What they are called in settings, summaries and the log."""
 JUDGEMENTS = {"Comparison", "Ranking", "Choice", "Rating", "Skip"}
 EVENTS = {"comparison", "ranking", "choice", "rating"}

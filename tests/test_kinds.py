@@ -1,8 +1,9 @@
-"""The kinds of candidate, and a third one that no file of the product names: it goes through the house all the same."""
+"""The kinds of candidate, and a fourth that no file of the product names: it goes through the house all the same."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -23,7 +24,7 @@ from prefrl.exchange.source import check_candidates
 from prefrl.fit.settings import FittingSettings
 from prefrl.fit.trainer import fit
 from prefrl.judgements import Comparison
-from prefrl.kinds import RESPONSES, SEGMENTS, Kind, Shown, find, kind_of, logged, named, only
+from prefrl.kinds import PICTURES, RESPONSES, SEGMENTS, Kind, Shown, find, kind_of, logged, named, only
 from prefrl.label.oracle import OracleSettings
 from prefrl.label.web import WebSettings, terms_of
 from prefrl.page.clips import worker
@@ -34,13 +35,13 @@ from prefrl.sample.select import ScoredSettings, UnscoredSettings
 from prefrl.storage.events import describe, load_foreign
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
-from prefrl.types import Floats, Query, Response, Segment, State, digest
+from prefrl.types import Floats, Picture, Query, Response, Segment, State, digest
 
 SIZE = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Drawing:
     """What was drawn for a caption."""
 
     caption: str
@@ -57,33 +58,33 @@ class Picture:
         return digest(self.caption, {"pixels": self.pixels})
 
 
-PICTURES = Kind(
-    name="pictures",
-    candidate=Picture,
-    noun="picture",
+DRAWINGS = Kind(
+    name="drawings",
+    candidate=Drawing,
+    noun="drawing",
     describe=lambda one: {"caption": one.caption},
-    load=lambda body, read: Picture(body["caption"], read()["pixels"]),
+    load=lambda body, read: Drawing(body["caption"], read()["pixels"]),
     arrays=lambda one: {"pixels": one.pixels},
     fault=lambda one: "" if one.pixels.dtype == np.uint8 else "has pixels that are no bytes",
     length=lambda one: one.pixels.size,
     unit=lambda _: "pixels",
     shows="clip",
     shown=lambda body: Shown(prompt=body["caption"], steps=1),
-    question="Which picture is better?",
+    question="Which drawing is better?",
     lease_seconds=77.0,
-    behaviour="picture",
+    behaviour="drawing",
 )
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """A task whose behaviours are pictures."""
+    """A task whose behaviours are drawings."""
 
     name: str = "gallery"
-    kind: str = "pictures"
+    kind: str = "drawings"
     fps: float = 1.0
 
-    def frames(self, candidate: Picture) -> np.ndarray:
+    def frames(self, candidate: Drawing) -> np.ndarray:
         return np.repeat(candidate.pixels[None, :, :, None], 3, axis=3)
 
 
@@ -96,13 +97,13 @@ class GallerySettings(Settings):
 
 @dataclass
 class Brightness:
-    """A reward model of pictures with one weight a member: how much the mean of the pixels counts."""
+    """A reward model of drawings with one weight a member: how much the mean of the pixels counts."""
 
     weights: torch.nn.Parameter = field(default_factory=lambda: torch.nn.Parameter(torch.tensor([[0.0], [0.1]])))
     fitted: bool = False
     members: int = 2
 
-    def stack(self, candidates: Sequence[Picture]) -> Mapping[str, torch.Tensor]:
+    def stack(self, candidates: Sequence[Drawing]) -> Mapping[str, torch.Tensor]:
         return {"mean": torch.tensor([one.pixels.mean() / 255 for one in candidates], dtype=torch.float32)}
 
     def scores(self, stacked: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -121,17 +122,17 @@ class Brightness:
     def calibrate(self, temperature: float) -> None:
         self.weights.data /= temperature
 
-    def raw_member_scores(self, candidates: Sequence[Picture]) -> Floats:
+    def raw_member_scores(self, candidates: Sequence[Drawing]) -> Floats:
         return self.scores(self.stack(candidates)).detach().numpy()
 
-    def member_scores(self, candidates: Sequence[Picture]) -> Floats:
+    def member_scores(self, candidates: Sequence[Drawing]) -> Floats:
         return self.raw_member_scores(candidates)
 
-    def score(self, candidates: Sequence[Picture]) -> Floats:
+    def score(self, candidates: Sequence[Drawing]) -> Floats:
         found: Floats = self.raw_member_scores(candidates).mean(0)
         return found
 
-    def features(self, candidates: Sequence[Picture]) -> Floats:
+    def features(self, candidates: Sequence[Drawing]) -> Floats:
         return np.array([[one.pixels.mean(), one.pixels.std()] for one in candidates])
 
     def state(self) -> State:
@@ -143,22 +144,22 @@ class Brightness:
 
 @pytest.fixture(autouse=True)
 def _installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A package brings the third kind, as far as anybody can tell."""
-    points = [EntryPoint("pictures", "test_kinds:PICTURES", "prefrl.kinds")]
+    """A package brings a fourth kind, as far as anybody can tell."""
+    points = [EntryPoint("drawings", "test_kinds:DRAWINGS", "prefrl.kinds")]
     monkeypatch.setattr(kinds, "entry_points", lambda group: points if group == "prefrl.kinds" else [])
     kinds.plugins.cache_clear()
     yield
     kinds.plugins.cache_clear()
 
 
-def drawn(count: int, caption: str = "a square") -> list[Picture]:
-    """Pictures whose gold is how bright they are."""
+def drawn(count: int, caption: str = "a square") -> list[Drawing]:
+    """Drawings whose gold is how bright they are."""
     rng = np.random.default_rng(0)
     found = [rng.integers(0, int(rng.integers(20, 256)), (SIZE, SIZE), np.uint8) for _ in range(count)]
-    return [Picture(caption, pixels, np.array([pixels.mean() / 255])) for pixels in found]
+    return [Drawing(caption, pixels, np.array([pixels.mean() / 255])) for pixels in found]
 
 
-def pairs(count: int) -> list[Query[Picture]]:
+def pairs(count: int) -> list[Query[Drawing]]:
     some = drawn(2 * count)
     return [Query((a, b)) for a, b in zip(some[::2], some[1::2], strict=True)]
 
@@ -170,7 +171,8 @@ def test_a_kind_is_found_by_its_name_its_noun_and_its_class() -> None:
     steps = np.zeros((2, 3), np.float32)
     assert named("control") is logged("segment") is kind_of(Segment(steps, steps, "e", 0)) is SEGMENTS
     assert named("text") is logged("response") is kind_of(Response("p", "t")) is RESPONSES
-    assert named("pictures") is logged("picture") is kind_of(drawn(1)[0]) is PICTURES
+    assert named("pictures") is kind_of(Picture("a three", np.zeros((2, 2), np.uint8))) is PICTURES
+    assert named("drawings") is logged("drawing") is kind_of(drawn(1)[0]) is DRAWINGS
     assert find("sound") is None
     with pytest.raises(ValueError, match="unknown kind of candidate 'contrl'; did you mean 'control'"):
         named("contrl")
@@ -181,13 +183,14 @@ def test_a_kind_is_found_by_its_name_its_noun_and_its_class() -> None:
 def test_candidates_of_another_class_are_refused_as_their_reader_says() -> None:
     texts = [Response("p", "t")]
     assert only(Response, texts, ValueError()) == texts
-    with pytest.raises(KeyError, match="no pictures"):
-        only(Response, [*texts, *drawn(1)], KeyError("no pictures"))
+    with pytest.raises(KeyError, match="no drawings"):
+        only(Response, [*texts, *drawn(1)], KeyError("no drawings"))
 
 
 def test_candidates_of_every_kind_are_what_they_were_after_a_way_through_json() -> None:
     steps = np.ones((4, 3), np.float32)
-    for one in (Segment(steps, steps, "e", 7, states=steps), Response("p", "t", (1,), (2, 3)), drawn(1)[0]):
+    texts, pixels = Response("p", "t", (1,), (2, 3)), np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    for one in (Segment(steps, steps, "e", 7, states=steps), texts, Picture("a three", pixels), drawn(1)[0]):
         kind = kind_of(one)
         loaded = kind.load(json.loads(json.dumps(kind.describe(one))), partial(kind.arrays, one))
         assert loaded.id == one.id
@@ -195,17 +198,30 @@ def test_candidates_of_every_kind_are_what_they_were_after_a_way_through_json() 
         assert describe(one)["type"] == kind.noun
 
 
-# --- a third kind -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("pixels", "fault"),
+    [
+        (np.zeros((2, 2)), "of type float64; expected bytes"),
+        (np.zeros((2, 2, 4), np.uint8), r"of shape \(2, 2, 4\); expected"),
+        (np.zeros((0, 2), np.uint8), r"of shape \(0, 2\); expected"),
+        (np.zeros(4, np.uint8), r"of shape \(4,\); expected"),
+    ],
+)
+def test_pixels_that_are_no_picture_are_told(pixels: np.ndarray, fault: str) -> None:
+    assert re.search(fault, PICTURES.fault(Picture("a three", pixels)))
 
 
-def test_pictures_are_asked_about_answered_and_read_again(tmp_path: Path) -> None:
+# --- a fourth kind ----------------------------------------------------------------------------------------------------
+
+
+def test_drawings_are_asked_about_answered_and_read_again(tmp_path: Path) -> None:
     queries = pairs(3)
-    with Store[Picture](tmp_path) as store:
+    with Store[Drawing](tmp_path) as store:
         store.ask(queries)
         store.answer([Comparison(queries[0].id, 1.0, "ann")])
-        with pytest.raises(StoreError, match="holds pictures, and cannot hold Responses"):
+        with pytest.raises(StoreError, match="holds drawings, and cannot hold Responses"):
             Store[Any].ask(store, [Query((Response("p", "a"), Response("p", "b")))])
-    with Store[Picture](tmp_path, write=False) as store:
+    with Store[Drawing](tmp_path, write=False) as store:
         (judged,) = store.judged()
         assert [c.id for c in judged.query.candidates] == [c.id for c in queries[0].candidates]
         assert np.array_equal(judged.query.candidates[0].pixels, queries[0].candidates[0].pixels)
@@ -216,24 +232,24 @@ def test_pictures_are_asked_about_answered_and_read_again(tmp_path: Path) -> Non
         assert [q.id for q in store.open_queries()] == [q.id for q in queries[1:]]
 
 
-def test_a_bundle_carries_pictures_and_a_false_one_is_refused(tmp_path: Path) -> None:
+def test_a_bundle_carries_drawings_and_a_false_one_is_refused(tmp_path: Path) -> None:
     queries = pairs(2)
-    with Store[Picture](tmp_path / "from") as store, Store[Picture](tmp_path / "to") as other:
+    with Store[Drawing](tmp_path / "from") as store, Store[Drawing](tmp_path / "to") as other:
         store.ask(queries)
         store.answer([Comparison(query.id, 0.0, "ann") for query in queries])
         export_bundle(store, tmp_path / "bundle")
         import_bundle(tmp_path / "bundle", other)
         assert [one.judgement for one in other.judged()] == [one.judgement for one in store.judged()]
         assert [one.query.id for one in other.judged()] == [query.id for query in queries]
-        false = Picture("a square", np.zeros((2, 2)))
+        false = Drawing("a square", np.zeros((2, 2)))
         other._file_one(false)
         with pytest.raises(StoreError, match="has pixels that are no bytes"):
             load_foreign(false.id, describe(false), other.folder / "blobs")
 
 
-def test_a_reward_model_of_pictures_is_fitted_on_what_an_oracle_says(tmp_path: Path) -> None:
+def test_a_reward_model_of_drawings_is_fitted_on_what_an_oracle_says(tmp_path: Path) -> None:
     reward = Brightness()
-    with Store[Picture](tmp_path) as store:
+    with Store[Drawing](tmp_path) as store:
         store.ask(pairs(20))
         OracleSettings().build(Gallery()).answer(store, np.random.default_rng(0))
         check_candidates(store.judged(), Gallery())
@@ -243,17 +259,17 @@ def test_a_reward_model_of_pictures_is_fitted_on_what_an_oracle_says(tmp_path: P
     assert float(reward.weights.detach().min()) > 0.5
 
 
-def test_queries_about_pictures_are_selected() -> None:
+def test_queries_about_drawings_are_selected() -> None:
     pool, reward, rng = [*drawn(12), *drawn(12, "a circle")], Brightness(), np.random.default_rng(0)
     for settings in (UnscoredSettings(), UnscoredSettings(kind="coverage"), ScoredSettings(kind="disagreement")):
         reward.fitted = True
-        selector: Selector[Picture] = settings.build()
+        selector: Selector[Drawing] = settings.build()
         chosen = selector.select(pool, reward, 4, rng)
         assert len(chosen) == 4
         assert all(len({c.caption for c in query.candidates}) == 1 for query in chosen)
 
 
-def test_pictures_are_measured_and_shown_in_a_report(tmp_path: Path) -> None:
+def test_drawings_are_measured_and_shown_in_a_report(tmp_path: Path) -> None:
     one = drawn(1)[0]
     assert (length(one), context(one)) == (SIZE * SIZE, "a square")
     (shown,) = json.loads(save_examples(Gallery(), [one], None, tmp_path, "after").read_text())
@@ -279,11 +295,11 @@ class Addresses:
         return {}
 
 
-def test_people_judge_pictures_on_the_page(tmp_path: Path) -> None:
+def test_people_judge_drawings_on_the_page(tmp_path: Path) -> None:
     queries, clips = pairs(2), Addresses()
     terms = terms_of(WebSettings(check_share=0, repeat_share=0), Gallery(), fixed=True)
-    assert (terms.page.question, terms.policy.lease_seconds) == ("Which picture is better?", 77.0)
-    with Store[Picture](tmp_path) as store:
+    assert (terms.page.question, terms.policy.lease_seconds) == ("Which drawing is better?", 77.0)
+    with Store[Drawing](tmp_path) as store:
         store.ask(queries)
         service = Service(store, terms, clips=clips)
         service.open()
@@ -291,7 +307,7 @@ def test_people_judge_pictures_on_the_page(tmp_path: Path) -> None:
             ann = log_in(service, "ann")
             (card,) = ask_for(ann)
             (query,) = (q for q in queries if q.id == card["query_id"])
-            assert (card["kind"], card["prompt"]) == ("pictures", "a square")
+            assert (card["kind"], card["prompt"]) == ("drawings", "a square")
             assert {item["media"][0] for item in card["items"]} == {f"/clips/{c.id}.webp" for c in query.candidates}
             assert all(item["steps"] == 1 and item["text"] is None for item in card["items"])
             assert set(clips.wanted) == {c.id for c in query.candidates}
@@ -305,9 +321,9 @@ def test_people_judge_pictures_on_the_page(tmp_path: Path) -> None:
     assert judged.judgement.labeler == "ann"
 
 
-def test_the_clip_of_a_picture_is_drawn_by_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clip_of_a_drawing_is_drawn_by_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (query,) = pairs(1)
-    with Store[Picture](tmp_path) as store:
+    with Store[Drawing](tmp_path) as store:
         store.ask([query])
     (tmp_path / "config.yaml").write_text("task: {kind: gallery}\n")
     monkeypatch.setattr(worker, "settings_class", lambda role, kind: GallerySettings)

@@ -1,4 +1,4 @@
-"""The loop end to end on the toy presets: every claim holds for control and for text."""
+"""The loop end to end on the toy presets: every claim holds for control, for text and for pictures."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from prefrl.stages import shrink
 from prefrl.store import Store as SQLStore
 from prefrl.types import Query
 
-TOYS = ["control/toy", "text/toy"]
+TOYS = ["control/toy", "text/toy", "pictures/digits"]
 
 
 def build(name: str, folder: Path, *overrides: str) -> Loop[Any]:
@@ -139,9 +139,9 @@ def test_a_discriminator_of_what_was_shown_does_not_see_the_gold(tmp_path: Path)
 
 
 def hide_gold(task: Any) -> None:
-    """Make the task itself give NaN: environments' rewards, or the scorer of texts."""
-    if task.kind == "text":
-        object.__setattr__(task, "gold", lambda responses: np.full(len(responses), np.nan))
+    """Make the task itself give NaN: environments' rewards, or the scorer of texts or pictures."""
+    if task.kind != "control":
+        object.__setattr__(task, "gold", lambda candidates: np.full(len(candidates), np.nan))
         return
     make = task.environments
 

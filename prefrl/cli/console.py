@@ -172,6 +172,7 @@ def round_line(round: Round) -> Text:
         ("fit/accuracy_held_out", "accuracy", ".2f"),
         ("evaluate/kl", "kl", ".2f"),
         ("evaluate/fluency", "fluency", ".2f"),
+        ("evaluate/spread", "spread", ".2f"),
         ("label/answered", "labels", ".0f"),
         ("steps/learn", "steps", ",.0f"),
     ):

@@ -39,6 +39,7 @@ class Form(StrEnum):
     arena = "arena"
     csv = "csv"
     minari = "minari"
+    pick_a_pic = "pick-a-pic"
     bundle = "bundle"
     classifier = "classifier"
     policy = "policy"
@@ -66,6 +67,7 @@ class Rows(StrEnum):
     argilla = "argilla"
     label_studio = "label-studio"
     arena = "arena"
+    pick_a_pic = "pick-a-pic"
 
 
 MODELS = {Form.classifier: "text", Form.policy: "text", Form.adapter: "text", Form.sb3: "control", Form.onnx: "control"}

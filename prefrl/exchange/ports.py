@@ -12,6 +12,7 @@ from prefrl.exchange.bundles import export_bundle, import_bundle, is_bundle, try
 from prefrl.exchange.exports.dataset import export_dataset
 from prefrl.exchange.exports.given import Exported
 from prefrl.exchange.exports.minari import export_minari
+from prefrl.exchange.exports.pickapic import export_pickapic
 from prefrl.exchange.exports.rows import (
     export_demonstrations,
     export_judgements,
@@ -59,6 +60,7 @@ EXPORTS: Mapping[str, Callable[[Store, Path, str], Exported]] = {
     "arena": lambda store, path, _: export_arena(store, path),
     "csv": lambda store, path, _: export_csv(store, path),
     "minari": lambda store, path, _: export_minari(store, path),
+    "pick-a-pic": lambda store, path, _: export_pickapic(store, path),
     "bundle": lambda store, path, _: export_bundle(store, path),
 }
 """What writes each form; the text says what becomes of ties, where a form has none: "drop" or "both"."""

@@ -7,7 +7,7 @@
 - `{"prompt", "responses": [...]}` with one of `"ranks"`, `"best"`, `"ratings"` (and `"scale"`), `"preference"` or
   `"skip"`;
 - conversation trees of OpenAssistant (Koepf et al. 2023): a ranking of the replies to each of a person's turns;
-- what labelling tools write: see `tool_rows`.
+- what labelling tools write: see `tool_rows`; and pairs of pictures: see `picture_rows`.
 
 `"labeler"`, `"weight"`, `"shown"` and `"split"` may be added to a row of the first three forms.
 """
@@ -33,6 +33,7 @@ from prefrl.exchange.layout import (
     optional,
     responses,
 )
+from prefrl.exchange.picture_rows import picture_pair
 from prefrl.exchange.reading import Line, parse_json, read_rows
 from prefrl.exchange.transcripts import (
     CUE,
@@ -87,6 +88,8 @@ def form_of(row: Fields) -> str:
         return "arena"
     if isinstance(row.get("prompt"), Mapping):
         return "tree"
+    if "jpg_0" in row:
+        return "pick-a-pic"
     if row.get("responses") is not None:
         return "responses"
     if "completion" in row and "chosen" not in row:
@@ -280,5 +283,6 @@ FORMS: Mapping[str, Callable[[Fields], list[Row | str]]] = {
     "argilla": partial(_of_tool, "argilla"),
     "label-studio": partial(_of_tool, "label-studio"),
     "arena": partial(_of_tool, "arena"),
+    "pick-a-pic": picture_pair,
 }
 """What reads the rows of each form."""

@@ -1,8 +1,9 @@
 """The one update that every policy gradient here makes: gradient steps on a batch that was sampled before.
 
 Variant: PPO's surrogate (Schulman et al. 2017) or the plain policy gradient; a critic and an entropy bonus are terms
-beside it, and a KL to a reference is part of the advantages. Each term is averaged over the whole minibatch, however
-many parts it goes through the network in. It sees a policy and a batch, and nothing of the world that they come from.
+beside it, and a KL to a reference is part of the advantages, or a term as well where a policy knows it exactly. Each
+term is averaged over the whole minibatch, however many parts it goes through the network in. It sees a policy and a
+batch, and nothing of the world that they come from.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from prefrl.improve.objectives import (
     reduce,
     value_loss,
 )
-from prefrl.protocols import ByHand, Columns, I, Policy
+from prefrl.protocols import Anchored, ByHand, Columns, I, Policy
 from prefrl.seeding import to_numpy
 from prefrl.types import Integers, Metrics
 
@@ -166,8 +167,8 @@ def step(
     """One gradient step, by automatic differentiation.
 
     Metrics, means over steps unless said: loss, grad_norm (before it is shortened), policy_loss (averaged as the
-    objective says), value_loss and entropy where there are any, clipped (the share of ratios beyond the clip), kl_old
-    (from the policy that drew the batch, estimator k3) and ratio_error (the largest |pi / pi_old - 1|).
+    objective says), value_loss, kl_loss and entropy where there are any, clipped (the share of ratios beyond the clip),
+    kl_old (from the policy that drew the batch, estimator k3) and ratio_error (the largest |pi / pi_old - 1|).
     """
     mask = batch.inputs.mask
     # Counts of the whole minibatch: a mean of the parts' means would give short parts too much weight.
@@ -282,6 +283,8 @@ def _losses(
     if not objective.policy:
         loss = _value(policy.values(batch.inputs), batch, objective) / steps
         return loss, {"value_loss": loss.detach()}
+    if objective.kl:
+        return _held_losses(policy, batch, objective, rows, steps)
     logp, entropies, values = _outputs(policy, batch.inputs, bool(objective.value))
     ratios = log_ratio(logp, batch.logp, mask)
     gain = _gain(logp, ratios, batch, objective)
@@ -294,6 +297,20 @@ def _losses(
         entropy = masked_sum(entropies, mask) / steps
         loss, seen["entropy"] = loss - objective.entropy * entropy, entropy.detach()
     return loss, seen | _distances(ratios.detach(), objective, steps)
+
+
+def _held_losses(
+    policy: Policy[I], batch: Batch[I], objective: Objective, rows: int, steps: int
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """As `_losses`, with the KL to the starting policy as a term of its own: averaged as the policy's."""
+    assert isinstance(policy, Anchored)
+    mask = batch.inputs.mask
+    logp, kls = policy.log_prob_and_kl(batch.inputs)
+    ratios = log_ratio(logp, batch.logp, mask)
+    policy_loss = reduce(_gain(logp, ratios, batch, objective), mask, objective.reduction, rows, steps)
+    kl = reduce(kls, mask, objective.reduction, rows, steps)
+    seen = {"policy_loss": policy_loss.detach(), "kl_loss": kl.detach()}
+    return policy_loss + objective.kl * kl, seen | _distances(ratios.detach(), objective, steps)
 
 
 def _gain(logp: Tensor, ratios: Tensor, batch: Batch[I], objective: Objective) -> Tensor:

@@ -33,6 +33,8 @@ class Objective:
     """How far a value may go from the batch's before its loss no longer falls; None for the plain loss."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
+    kl: float = 0.0
+    """Weight of the exact KL of each step to the starting policy, for policies that know it (DPOK, Fan et al. 2023)."""
     reduction: Reduction = "token"
     """How the steps of the policy's terms are averaged; the critic's and the entropy's are means over steps."""
     max_grad_norm: float = math.inf

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -22,20 +21,26 @@ from torch import Tensor
 from prefrl.components import Settings, filled_in
 from prefrl.evaluate.policies import scored
 from prefrl.improve.gradient import Batch, update
+from prefrl.improve.groups import (
+    ADVANTAGES,
+    AVERAGES,
+    Weighing,
+    by_group,
+    check_ratio,
+    distances,
+    equal_groups,
+    finite,
+    mean,
+    minibatches,
+    rewarded,
+)
 from prefrl.improve.objectives import (
     AdaptiveKL,
     Objective,
     Reduction,
-    all_equal,
-    batch_centred,
-    batch_scaled,
-    group_normalised,
     kl_k1,
-    kl_k3,
-    leave_one_out,
     masked_mean,
     masked_whiten,
-    step_rewards,
     win_rates,
 )
 from prefrl.improve.ppo import CriticSettings, by_token, check_start, critic_formula, start_from_reward
@@ -43,7 +48,7 @@ from prefrl.improve.writer import Schedule, Writer
 from prefrl.policies.language import LanguageSettings, enough_memory
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store, Task, TextTask, text
-from prefrl.seeding import Device, generator
+from prefrl.seeding import Device
 from prefrl.types import Evaluation, Metrics, Response, State, Steps
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
@@ -233,7 +238,7 @@ class TextLearner:
             self._move_reference()
             if self._settings.kl_stop is not None and measured["kl"] > self._settings.kl_stop:
                 break
-        means = {name: _mean(values) for name, values in seen.items()}
+        means = {name: mean(values) for name, values in seen.items()}
         return means | {"ratio_error": max(seen["ratio_error"]), "updates": float(len(seen["ratio_error"]))}
 
     def check_reward(self, reward: RewardModel[Response]) -> None:
@@ -263,33 +268,31 @@ class TextLearner:
         settings = self._settings
         found = scored(reward, drawn.candidates(self._task.tokenizer))  # (B,)
         raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
-        known = ~raw.isnan()
-        scores = self._finite("reward", self._shaped(raw, drawn))  # NaN: what was not scored teaches nothing
+        scores = finite("reward", self._shaped(raw, drawn), self._updates)  # NaN: what was not scored teaches nothing
         if settings.score == "win_rate":
             scores = win_rates(scores.view(-1, settings.responses)).flatten()
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         batch, explained = self._batch(drawn, scores, kl)
-        minibatches, objective = self._minibatches(len(batch), rng), self._objective()
+        rows, objective = self._minibatches(len(batch), rng), self._objective()
         with enough_memory("learner.policy.chunk", settings.policy.chunk):
-            steps = update(self.policy, self._writer.optimizer, batch, minibatches, objective, settings.policy.chunk)
-        self._check_ratio(steps[0]["ratio_error"])
+            steps = update(self.policy, self._writer.optimizer, batch, rows, objective, settings.policy.chunk)
+        most = RATIO_TOLERANCE[self.policy.model.dtype]
+        check_ratio(steps[0]["ratio_error"], most, self._updates, "set task.dtype=float32")
         # Per response, as the target is: a mean per token would be smaller by the length.
         sequence_kl = float(kl.sum(1).mean())
         if settings.kl_target is not None:
             self._kl = self._kl.update(sequence_kl, len(batch))
         return steps[-1] | {
             "ratio_error": steps[0]["ratio_error"],
-            "reward": float(raw.nanmean()),
-            "reward_std": float(raw[known].std(correction=0)) if known.any() else math.nan,
-            "unscored": float(scores.isnan().float().mean()),
-            **(self._distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
+            **rewarded(raw, scores),
+            **(distances(kl, drawn.mask) if self._measures else {}),  # what was not measured is absent, not 0
             **explained,
             "surprise": -float(masked_mean(drawn.logp, drawn.mask)),
             "length": float(drawn.mask.sum(1).float().mean()),
             "ended": float(drawn.ended.float().mean()),
             "beta": self._kl.beta,
-            **self._equal_groups(scores),
+            **equal_groups(scores.view(-1, settings.responses)),
         }
 
     def _batch(self, drawn: Responses, scores: Tensor, kl: Tensor) -> tuple[Batch[Responses], Metrics]:
@@ -298,36 +301,15 @@ class TextLearner:
         if settings.advantage == "gae":
             return by_token(self.policy, drawn, scores, kl, self._kl.beta, settings.critic.trace, settings.whiten)
         known = drawn.mask & ~scores.isnan()[:, None]
-        advantages = self._by_response(drawn, scores, kl).view(-1, 1)
+        # All responses to a prompt stand together.
+        how = Weighing(settings.advantage, settings.kl_in, self._kl.beta)
+        advantages = by_group(scores, kl, drawn.mask, settings.responses, how).view(-1, 1)
         if settings.kl_in == "token":
             following = kl.flip(1).cumsum(1).flip(1)  # (B, L): of each token and those after it
             advantages = torch.where(known, advantages - self._kl.beta * following, 0.0)
         if settings.whiten:
             advantages = masked_whiten(advantages.expand_as(known), known)
         return Batch(drawn, drawn.logp, advantages), {}
-
-    def _by_response(self, drawn: Responses, scores: Tensor, kl: Tensor) -> Tensor:
-        """(P, K): the same advantage for all tokens of a response."""
-        settings = self._settings
-        in_reward = self._kl.beta if settings.kl_in == "reward" else 0.0
-        # (B,): one return a response, so the KL is in it before the baseline is taken off.
-        returns = step_rewards(scores, kl, drawn.mask, in_reward).sum(1)
-        groups = returns.view(-1, settings.responses)  # (P, K): all responses to a prompt stand together
-        kls = torch.where(scores.isnan(), math.nan, kl.sum(1)).view_as(groups)
-        return advantages_of(groups, settings.advantage) - self._kl_advantages(kls)
-
-    def _equal_groups(self, scores: Tensor) -> Metrics:
-        """The share of prompts whose responses all have the same score, where there are several."""
-        groups = scores.view(-1, self._settings.responses)
-        return {"equal_groups": float(all_equal(groups).float().mean())} if groups.shape[1] > 1 else {}
-
-    def _check_ratio(self, error: float) -> None:
-        """Before a batch's first step the policy is the one that drew it: anything but rounding is a bug."""
-        if error > RATIO_TOLERANCE[self.policy.model.dtype]:
-            raise FloatingPointError(
-                f"update {self._updates}: the policy gives its own samples other probabilities than it drew them with "
-                f"(ratio off by {error:.2g}); set task.dtype=float32, and report it if that does not help"
-            )
 
     def _objective(self) -> Objective:
         """What a gradient step minimises."""
@@ -336,17 +318,6 @@ class TextLearner:
         if settings.advantage != "gae":
             return objective
         return replace(objective, value=critic.weight, value_clip=critic.clip)
-
-    def _kl_advantages(self, kls: Tensor) -> Tensor | float:
-        """(P, K): what the KL of each response takes off its advantage, where it is not in the reward.
-
-        With the same baseline, so that at the optimum of reward minus beta x KL both cancel in each sample.
-        """
-        settings = self._settings
-        if settings.kl_in != "advantage" or not settings.beta:
-            return 0.0
-        baseline = "batch_mean" if settings.advantage == "batch_mean" else "leave_one_out"
-        return self._kl.beta * advantages_of(kls, baseline)
 
     def _reference_logp(self, drawn: Responses) -> Tensor:
         """(B, L) under the reference; where the KL does not count that is not run, and the policy stands in."""
@@ -365,16 +336,9 @@ class TextLearner:
         """Whether anything wants to know how far the policy is from where it started."""
         return self._settings.beta > 0 or self._settings.kl_stop is not None
 
-    def _distances(self, kl: Tensor, mask: Tensor) -> Metrics:
-        """Two estimates of the KL per response: k1, and k3, which is never negative."""
-        k3 = kl_k3(kl, torch.zeros_like(kl))
-        return {"kl": float(kl.sum(1).mean()), "kl_k3": float(torch.where(mask, k3, 0.0).sum(1).mean())}
-
     def _minibatches(self, size: int, rng: np.random.Generator) -> list[Tensor]:
-        order = generator(rng)
-        each = -(-size // self._settings.minibatches)  # rounded up, so that there are no more than asked for
-        orders = [torch.randperm(size, generator=order).to(self.policy.device) for _ in range(self._settings.epochs)]
-        found: list[Tensor] = [rows for one in orders for rows in one.split(each)]  # type: ignore[no-untyped-call]
+        settings = self._settings
+        found = minibatches(size, settings.epochs, settings.minibatches, rng, self.policy.device)
         self.policy.check_share(min(map(len, found)))
         return found
 
@@ -385,38 +349,6 @@ class TextLearner:
         if settings.drop_unended:
             kept = torch.where(drawn.ended, kept, math.nan)
         return kept - settings.missing_end_penalty * ~drawn.ended - settings.length_cost * drawn.mask.sum(1)
-
-    def _finite(self, name: str, values: Tensor) -> Tensor:
-        if values.isinf().any():
-            raise FloatingPointError(
-                f"the {name} of update {self._updates} is not finite: {values.detach().flatten()[:4].tolist()}; "
-                "expected finite numbers: look at the reward model's last fit"
-            )
-        return values
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Of the batches in which it is defined."""
-    known = [value for value in values if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
-
-
-def advantages_of(returns: Tensor, how: str) -> Tensor:
-    """(P, K) returns of K responses to each of P prompts -> (P, K) advantages."""
-    if how == "leave_one_out":
-        return leave_one_out(returns)
-    scaled = {"group_normalised": group_normalised, "batch_scaled": batch_scaled, "batch_mean": batch_centred}
-    return scaled[how](returns)
-
-
-AVERAGES = {"constant": "mean_i sum_t", "token": "mean over all tokens", "sequence": "mean_i mean_t"}
-ADVANTAGES = {
-    "leave_one_out": "R_i - mean of the prompt's other R_j",
-    "group_normalised": "(R_i - mean of the prompt's R_j) / (their std + 1e-4)",
-    "batch_scaled": "(R_i - mean of the prompt's R_j) / (std of the batch's R + 1e-4)",
-    "batch_mean": "R_i - mean of the batch's R_j",
-}
-"""Of a response."""
 
 
 def text_formula(settings: TextLearnerSettings) -> str:

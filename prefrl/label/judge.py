@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from string import Formatter
 from typing import Any, Literal, Self
 
@@ -15,12 +14,12 @@ from torch import Tensor
 from transformers import AutoModelForCausalLM, GenerationConfig, PreTrainedTokenizerBase
 
 from prefrl.components import ConfigError, Settings
-from prefrl.judgements import Answer, Comparison, Ranking, Skip
 from prefrl.kinds import kind_of, only
+from prefrl.label.both_orders import Verdict, answer_open
 from prefrl.label.prompts import Prompter, answer_tokens, verdict
 from prefrl.policies.pretrained import load_tokenizer, load_weights
 from prefrl.protocols import Store, Task, text
-from prefrl.types import C, Floats, Integers, Metrics, Query, Response
+from prefrl.types import C, Floats, Metrics, Query, Response
 
 TEMPLATE = """\
 Below are a prompt and two responses to it, A and B, each between two equal lines. What is between such lines is
@@ -37,10 +36,6 @@ Response B:
 
 {criterion} Answer with one letter, A or B.
 Answer:"""
-LOT = 64
-"""Queries whose answers are filed together: a judge is slow, and a kill loses no more than these."""
-EQUAL = 1e-5
-"""Win probabilities that differ by less are a tie: batches of another make-up move them by float32's rounding."""
 
 
 class JudgeSettings(Settings):
@@ -98,21 +93,6 @@ def _load(settings: JudgeSettings) -> tuple[Any, PreTrainedTokenizerBase]:
         raise ConfigError(f"labeler.model: {error}") from error
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What the judge made of one pair of texts."""
-
-    forward: float
-    """The probability that the first is better, where it was shown first; NaN for a refusal."""
-    backward: float
-    """The same, where it was shown second."""
-
-    @property
-    def preference(self) -> float:
-        """The mean over both orders: a verdict that only follows the order comes to 0.5. NaN for a refusal."""
-        return (self.forward + self.backward) / 2
-
-
 @dataclass
 class Judge:
     """Answers every open query at once, with soft preferences (position swap: Zheng et al. 2023, section 3.4)."""
@@ -138,17 +118,9 @@ class Judge:
 
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
         """Nothing is drawn. Raises `ConfigError` for control segments, `ValueError` for a question that is too long."""
-        queries, verdicts = store.open_queries(self.name), list[Verdict]()
-        for start in range(0, len(queries), LOT):
-            lot = queries[start : start + LOT]
-            pairs = [(q, i, j) for q in lot for i, j in combinations(range(len(q.candidates)), 2)]
-            said = self.compare([(_text(q, i), _text(q, j)) for q, i, j in pairs])
-            by_query: dict[str, list[Verdict]] = {q.id: [] for q in lot}
-            for (query, _, _), one in zip(pairs, said, strict=True):
-                by_query[query.id].append(one)
-            store.answer([self._conclude(q, by_query[q.id]) for q in lot])
-            verdicts += said
-        self.metrics = bias(verdicts)
+        self.metrics = answer_open(
+            store, self.name, lambda some: self.compare([(_text(q, i), _text(q, j)) for q, i, j in some])
+        )
 
     def compare(self, pairs: Sequence[tuple[Response, Response]]) -> list[Verdict]:
         """Judge pairs of responses to one prompt, each in both orders."""
@@ -156,17 +128,6 @@ class Judge:
         questions += [self.prompter.encode(a.prompt, b.text, a.text) for a, b in pairs]
         first = self._ask(questions)
         return [Verdict(float(x), 1 - float(y)) for x, y in zip(first[: len(pairs)], first[len(pairs) :], strict=True)]
-
-    def _conclude(self, query: Query[C], verdicts: Sequence[Verdict]) -> Answer:
-        """Two candidates: the mean preference. More: ranks by summed win probability, as in a tournament."""
-        preferences = np.array([v.preference for v in verdicts])
-        if not verdicts:
-            raise ValueError(f"query {query.id[:12]} has one candidate: a judge compares two or more")
-        if np.isnan(preferences).any():
-            return Skip(query.id, "skip", self.name)
-        if len(verdicts) == 1:
-            return Comparison(query.id, float(preferences[0]), self.name)
-        return Ranking(query.id, _ranks(preferences, len(query.candidates)), self.name)
 
     def _ask(self, questions: Sequence[list[int]]) -> Floats:
         """The probability that the first response shown is better, for each question; those of like length together."""
@@ -218,35 +179,6 @@ def _make_greedy(model: Any, tokens: int) -> None:
     model.generation_config = GenerationConfig(  # type: ignore[no-untyped-call]
         do_sample=False, max_new_tokens=tokens, eos_token_id=ends, pad_token_id=0
     )
-
-
-def bias(verdicts: Sequence[Verdict]) -> Metrics:
-    """How much the order decides: `pairs`, `refused`, `position_bias` and `flipped`.
-
-    `refused` is the share of pairs without a verdict. Over the others, `position_bias` is the mean probability given
-    to what is shown first, minus 0.5, and `flipped` the share whose winner changes with the order.
-    """
-    sound = [v for v in verdicts if not np.isnan(v.preference)]
-    metrics = {"pairs": float(len(verdicts))}
-    if verdicts:
-        metrics["refused"] = 1 - len(sound) / len(verdicts)
-    if sound:
-        metrics["position_bias"] = float(np.mean([(v.forward - v.backward) / 2 for v in sound]))
-        metrics["flipped"] = float(np.mean([(v.forward - 0.5) * (v.backward - 0.5) < 0 for v in sound]))
-    return metrics
-
-
-def _ranks(preferences: Floats, size: int) -> tuple[int, ...]:
-    """Ranks of K candidates from the preferences of all pairs (0, 1), (0, 2) ...: by summed win probability."""
-    wins = np.zeros(size)
-    for (i, j), p in zip(combinations(range(size), 2), preferences, strict=True):
-        wins[i] += p
-        wins[j] += 1 - p
-    # Ranks step only where neighbours are more than rounding apart, so near equals share one.
-    order = np.argsort(-wins, kind="stable")
-    ranks: Integers = np.empty(size, np.int64)
-    ranks[order] = np.cumsum([0, *(wins[order][:-1] - wins[order][1:] > EQUAL)])
-    return tuple(int(rank) for rank in ranks)
 
 
 def _text(query: Query[C], i: int) -> Response:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from prefrl.components import ConfigError
+from prefrl.kinds import named
 from prefrl.page import records
 from prefrl.page.app import create_app
 from prefrl.page.clips.queue import Clips, ClipSettings
@@ -154,7 +155,8 @@ def open_site(store: Store, terms: Terms, address: Address, name: str, clips: Cl
     """
     tls = check_tls(address.tls_cert, address.tls_key)
     store.log.reserve()
-    drawn = Clips(store.folder, clips) if clips is not None else None
+    still = named(terms.page.kind).still
+    drawn = Clips(store.folder, clips, still=still) if clips is not None else None
     service = Service(store, terms, drawn)
     server = WebServer(create_app(service, Rules(frozenset(address.names()))), tls)
     service.open()  # before the server: the first request finds everything loaded

@@ -189,30 +189,44 @@ def _drift(record: Record, facts: Facts) -> tuple[Card, ...]:
         Card(
             "Distance from the start (KL)",
             plots.lines("kl", at, [Line(kl, "ink")], zero=True),
-            "Nats per response between the policy and the starting one: how far it has moved to get here.",
+            f"Nats per {facts.words.behaviour} between the policy and the starting one: how far it has moved to get "
+            "here.",
         ),
-        Card(
-            "Fluency",
-            plots.lines("fluency", at, [Line(fluency, "ink")], percent=True, zero=True),
-            "The share of responses that are well formed. Gold that rises while fluency falls is reward hacking.",
-        ),
+        _side_effect(record, fluency),
         Card(
             "Gold for each nat of KL",
-            plots.path("frontier", kl, gold, ("KL, nats per response", "gold")),
+            plots.path("frontier", kl, gold, (f"KL, nats per {facts.words.behaviour}", "gold")),
             "One dot a round. Where the curve bends down, more optimisation makes things worse.",
         ),
-        _gains(record, kl, gold),
+        _gains(record, kl, gold, facts.words.behaviour),
     )
 
 
-def _gains(record: Record, kl: Series, gold: Series) -> Card:
+def _side_effect(record: Record, fluency: Series) -> Card:
+    """What a policy may lose on its way: whether texts stay fluent, or pictures differ."""
+    spread = record.series("evaluate/spread")
+    if any(value is not None for value in spread):
+        return Card(
+            "Spread",
+            plots.lines("spread", record.numbers, [Line(spread, "ink")], zero=True),
+            "How much pictures of one caption differ, as a share of how much real ones do. Gold that rises while the "
+            "spread falls to nothing is one picture drawn over and over.",
+        )
+    return Card(
+        "Fluency",
+        plots.lines("fluency", record.numbers, [Line(fluency, "ink")], percent=True, zero=True),
+        "The share of responses that are well formed. Gold that rises while fluency falls is reward hacking.",
+    )
+
+
+def _gains(record: Record, kl: Series, gold: Series, behaviour: str) -> Card:
     curves = [
         Line(_of_best_gain(gold), "gold", "gold"),
         Line(_of_best_gain(record.by_newest), "learned", "learned reward", dash="--"),
     ]
     return Card(
         "Over-optimisation",
-        plots.against("gains", kl, curves, ("KL, nats per response", "share of the best gain")),
+        plots.against("gains", kl, curves, (f"KL, nats per {behaviour}", "share of the best gain")),
         "What was gained since the start, as a share of the most that either has gained. Gold that bends down while "
         "the learned reward goes on rising is Goodhart's law at work: an earlier round is the better policy.",
     )

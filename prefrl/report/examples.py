@@ -1,4 +1,4 @@
-"""A few candidates kept for the report: texts as they are, clips as small films and as strips of frames."""
+"""A few candidates kept for the report: texts and pictures as they are, clips as small films and strips of frames."""
 
 from __future__ import annotations
 
@@ -73,6 +73,8 @@ def _show(task: Task, candidate: Candidate, place: Path, file: str) -> Json:
     except Exception as error:  # a renderer may raise anything, and a missing picture must not end a run
         return {"caption": f"No picture: drawing failed with {type(error).__name__}: {error}"}
     save_strip(strip(frames), place / f"{file}.png")
+    if kind.still:
+        return {"strip": f"{file}.png", "still": True, "caption": shown.prompt or ""}
     save_film(frames, drawn.fps, place / f"{file}.webp")
     return {"strip": f"{file}.png", "film": f"{file}.webp", "caption": _caption(drawn, shown.steps)}
 

@@ -45,6 +45,8 @@ class Example:
     """A `data:` address of a PNG, or empty."""
     film: str = ""
     """A `data:` address of a WebP that plays, or empty."""
+    still: bool = False
+    """Whether it is a single picture."""
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,7 @@ def _example(entry: Json, folder: Path) -> Example:
         caption=problem or visible(entry.get("caption")),
         picture=picture,
         film=film,
+        still=entry.get("still") is True,
     )
 
 

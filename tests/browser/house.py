@@ -13,6 +13,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import sqlalchemy as sql
 
+from prefrl.envs.digits import DigitsSettings, real_digits
 from prefrl.envs.toys import PointSettings
 from prefrl.judgements import Answer, Comparison
 from prefrl.label.web import WebLabeler, WebSettings, showing
@@ -20,7 +21,7 @@ from prefrl.page.service import Service
 from prefrl.page.site import Site
 from prefrl.storage import tables
 from prefrl.store import Store
-from prefrl.types import Query, Response, Segment
+from prefrl.types import Picture, Query, Response, Segment
 
 STEPS = 15
 POINT = PointSettings(segment_steps=STEPS)
@@ -113,7 +114,9 @@ def serving(folder: Path, kind: str = "text", **settings: Any) -> Iterator[House
     """Serve the store of a folder; no check questions and no repeats, unless the test wants them."""
     quiet = {"guideline": "", "clips": {"ahead_seconds": 0}}
     chosen: dict[str, Any] = {"port": 0, "check_share": 0.0, "repeat_share": 0.0, **quiet} | settings
-    task: Any = POINT.build() if kind == "control" else SimpleNamespace(kind="text", name="short stories")
+    task: Any = SimpleNamespace(kind="text", name="short stories")
+    if kind != "text":
+        task = (POINT if kind == "control" else DigitsSettings()).build()
     with Store[Any](folder) as store:
         asks = WebSettings.model_validate(chosen)
         labeler = WebLabeler(asks, task, showing(asks.ask, task))
@@ -141,6 +144,12 @@ def clips(count: int) -> list[Query[Segment]]:
     return [Query((segment(2 * i), segment(2 * i + 1))) for i in range(count)]
 
 
+def digits(count: int, size: int = 2) -> list[Query[Picture]]:
+    """Queries over handwritten digits, as they lie in their package."""
+    pixels, _ = real_digits()
+    return [Query(tuple(Picture("a three", one) for one in pixels[size * i : size * (i + 1)])) for i in range(count)]
+
+
 def segment(number: int, drawable: bool = True) -> Segment:
     """A point that goes straight from somewhere to somewhere; without states it cannot be drawn."""
     rng = np.random.default_rng(number)
@@ -152,8 +161,9 @@ def segment(number: int, drawable: bool = True) -> Segment:
 def fill(folder: Path, queries: Sequence[Query[Any]]) -> Path:
     """A folder with a store and open queries."""
     folder.mkdir(parents=True, exist_ok=True)
-    if isinstance(queries[0].candidates[0], Segment):
-        (folder / "config.yaml").write_text(CONFIG)
+    if not isinstance(queries[0].candidates[0], Response):
+        control = isinstance(queries[0].candidates[0], Segment)
+        (folder / "config.yaml").write_text(CONFIG if control else "task: {kind: digits}\n")
     with Store[Any](folder) as store:
         store.ask(queries)
     return folder

@@ -132,7 +132,7 @@ def origin_of(link: str) -> str:
 Visit: TypeAlias = Callable[..., Visitor]
 """`visit(link, **options of the browser)`."""
 SHOWN = """() => [...document.querySelectorAll("[data-testid=question] .slot")].map((slot) => {
-  const source = slot.querySelector("video source");
+  const source = slot.querySelector("video source, .clip img");
   return source ? source.getAttribute("src") : slot.querySelector(".text-body")?.textContent ?? "";
 })"""
 

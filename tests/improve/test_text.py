@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from prefrl.components import ConfigError
 from prefrl.envs.text import Reviews
-from prefrl.improve.text import TextLearner, TextLearnerSettings, advantages_of, text_formula
+from prefrl.improve.groups import advantages_of
+from prefrl.improve.text import TextLearner, TextLearnerSettings, text_formula
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
 from prefrl.types import Floats, Response, State
@@ -329,13 +330,6 @@ def test_an_evaluation_is_over_what_was_scored(toy_reviews: Reviews) -> None:
 
     found = learner(toy_reviews).evaluate(cast("RewardModel[Response]", Some()), np.random.default_rng(0)).metrics
     assert (found["learned"], found["unscored"]) == (2.0, 0.25)
-
-
-def test_the_kl_does_not_teach_by_what_was_not_scored(toy_reviews: Reviews) -> None:
-    """However far such a response is from the start: it has no advantage, and is in no baseline."""
-    one = learner(toy_reviews, algorithm="grpo")
-    kls = torch.tensor([[0.0, 0.0, 0.0, math.nan]])
-    assert torch.equal(torch.as_tensor(one._kl_advantages(kls)), torch.zeros(1, 4))
 
 
 def test_a_kl_off_each_token_is_that_of_it_and_what_follows(toy_reviews: Reviews) -> None:

@@ -23,7 +23,8 @@ from prefrl import Config
 from prefrl.components import ConfigError
 from prefrl.envs.toys import PointSettings
 from prefrl.judgements import Comparison, Ranking, Skip
-from prefrl.label.judge import Judge, JudgeSettings, Verdict, bias
+from prefrl.label.both_orders import Verdict, bias
+from prefrl.label.judge import Judge, JudgeSettings
 from prefrl.label.prompts import Prompter, answer_tokens, fence_for, verdict
 from prefrl.policies.cloning import make_tokenizer
 from prefrl.store import Store
@@ -193,7 +194,7 @@ def test_a_judge_that_was_stopped_goes_on_where_it_stood(
     tmp_path: Path, tokenizer: PreTrainedTokenizerFast, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
     """What is filed in lots stays, and the rest comes out to the last bit as in one go."""
-    monkeypatch.setattr("prefrl.label.judge.LOT", 2)
+    monkeypatch.setattr("prefrl.label.both_orders.LOT", 2)
     queries = [responses("good " * n, "bad") for n in range(1, 6)]
     asked = judge(tiny(LlamaForCausalLM, tokenizer), tokenizer, minimum_mass=0.0, batch_size=3)
     with Store[Response](tmp_path / "whole") as whole, Store[Response](tmp_path / "part") as part:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import sqlalchemy as sql
 import yaml
@@ -82,14 +82,18 @@ def _judgement_columns() -> Any:
 
 
 def _write(path: Path, rows: Iterable[Fields], columns: Any) -> int:
+    path.parent.mkdir(parents=True)
+    return write_table(path, rows, columns)
+
+
+def write_table(to: Path | IO[bytes], rows: Iterable[Fields], columns: Any) -> int:
     """Write rows as Parquet, some at a time; returns how many."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path.parent.mkdir(parents=True)
     count = 0
     try:
-        with pq.ParquetWriter(path, columns) as table:
+        with pq.ParquetWriter(to, columns) as table:
             for some in chunks(rows, ROWS):
                 table.write_table(pa.Table.from_pylist(some, schema=columns))
                 count += len(some)

@@ -166,6 +166,8 @@ def _stills(frames: np.ndarray, fps: float, format: str) -> bytes:
     unit = 10 if format == "gif" else 1  # a GIF counts hundredths of a second
     ends = np.rint(np.arange(len(rest) + 2) * (step * 1000 / fps / unit)).astype(int) * unit
     options: Mapping[str, object] = {"quality": 80, "method": 2} if format == "webp" else {}
+    if format == "webp" and not rest:
+        options = {"lossless": True}  # a single picture is looked at closely
     data = BytesIO()
     durations = np.diff(ends).tolist()
     first.save(data, format, save_all=True, append_images=rest, duration=durations, loop=0, **options)

@@ -84,8 +84,10 @@ class Clips:
     for ever.
     """
 
-    def __init__(self, folder: Path, settings: ClipSettings, command: Sequence[str] = ()) -> None:
-        """`command` draws clips in place of `prefrl.page.clips.worker`, and speaks as it does."""
+    def __init__(self, folder: Path, settings: ClipSettings, command: Sequence[str] = (), still: bool = False) -> None:
+        """`command` draws clips in place of `prefrl.page.clips.worker`, and speaks as it does. `still`: a clip is one
+        picture, which loses nothing as a WebP."""
+        self._formats = ("webp",) if still else formats()
         self._folder, self._settings = folder, settings
         self._shelf = Shelf(folder / "clips", settings.cache_bytes)
         limits = settings.limit_seconds, settings.first_limit_seconds
@@ -95,7 +97,7 @@ class Clips:
         self._drawing: _Job | None = None
         self._failed: dict[str, tuple[str, float]] = {}
         """Why, and until when (monotonic seconds) that is believed."""
-        self._format = formats()[0]
+        self._format = self._formats[0]
         """What was last asked for: browsers without H.264 want what comes next to be prepared in another."""
         self._asked = self._drawn = 0
         self._closed = False
@@ -123,7 +125,7 @@ class Clips:
 
     def names(self, candidate: str) -> list[str]:
         """The addresses of a candidate's clip, best format first."""
-        return [f"{MEDIA}{self._name(candidate, format)}" for format in formats()]
+        return [f"{MEDIA}{self._name(candidate, format)}" for format in self._formats]
 
     def want(self, candidate: str, soon: bool = False) -> None:
         """Have a clip drawn ahead, `soon` or later; left undone where too many wait. Texts have none."""
@@ -154,7 +156,7 @@ class Clips:
     def retry(self, candidate: str) -> None:
         """Forget that a clip could not be drawn."""
         with self._turn:
-            for format in formats():
+            for format in self._formats:
                 self._failed.pop(self._name(candidate, format), None)
 
     async def get(self, name: str, wait: float) -> Path:
@@ -191,7 +193,7 @@ class Clips:
     def _candidate(self, name: str) -> str:
         """The candidate that a clip shows. Nothing that a client sends becomes part of a path before this."""
         match = NAME.fullmatch(name)
-        if match is None or match[2] not in formats():
+        if match is None or match[2] not in self._formats:
             raise ClipUnknown(f"no clip is called {name[:80]!r}")
         candidate = _mixed(match[1], self._picture())
         if not self._exists(candidate):

@@ -77,7 +77,8 @@ export class Question {
     this.#prompt = prompt;
     const bar = this.#bar(tools);
     this.#choices = bar.buttons;
-    const controls = this.#player && transport(this.#player);
+    const still = film && items.every((item) => item.steps === 1);
+    const controls = this.#player && !still && transport(this.#player);
     const form = this.#fill(items);
     this.#listen(bar.actions, controls?.actions, this.#responses?.actions);
     const beside = form instanceof Rewriting;
@@ -85,7 +86,7 @@ export class Question {
     const element = el(
       "article",
       {
-        class: `question ${film ? "film" : "text"} ${sort}`,
+        class: `question ${film ? "film" : "text"} ${sort}${still ? " still" : ""}`,
         testid: "question",
         data: { id: this.#assignment.assignment_id, kind, count: String(items.length), ready: "false" },
       },
@@ -222,8 +223,8 @@ export class Question {
   #gate() {
     const reason = this.#closed;
     const gate = this.#note;
-    const idle =
-      this.#player && !this.#player.playing && !this.#player.failed && this.#player.time * this.#player.fps < 1;
+    const player = this.#player;
+    const idle = player && !player.still && !player.playing && !player.failed && player.time * player.fps < 1;
     const words = reason || (idle && this.element.dataset.ready === "true" ? t("gate.play") : "");
     if (gate.textContent !== words) gate.textContent = words;
     gate.hidden = !words;

@@ -220,7 +220,7 @@ def test_a_file_can_be_packed(full: Store[Response], tmp_path: Path) -> None:
     assert gzip.decompress((tmp_path / "out.jsonl.gz").read_bytes()) == (tmp_path / "out.jsonl").read_bytes()
 
 
-@pytest.mark.parametrize("form", sorted(set(EXPORTS) - {"bundle", "minari"}))
+@pytest.mark.parametrize("form", sorted(set(EXPORTS) - {"bundle", "minari", "pick-a-pic"}))
 def test_segments_fit_no_form_for_texts(
     store: Store[Segment], make_query: Callable[..., Query[Segment]], tmp_path: Path, form: str
 ) -> None:
