@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from prefrl.kinds import find
 from prefrl.protocols import DrawnTask, Task
 from prefrl.types import Json
 
@@ -48,6 +49,12 @@ def read_metrics(folder: Path) -> list[Json]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def pace(task: Task) -> float | None:
+    """Steps a second of the world that a task stands for; None where there is none: for texts and pictures."""
+    kind = find(task.kind)
+    return task.fps if isinstance(task, DrawnTask) and kind is not None and kind.stepwise else None
+
+
 def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: float = 0.0) -> Json:
     """One flat account of a run from its metrics; None where something was not measured.
 
@@ -72,7 +79,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: f
         "kl": last.get("evaluate/kl"),
         "fluency_before": first.get("evaluate/fluency"),
         "fluency_after": last.get("evaluate/fluency"),
-        "steps_per_second": task.fps if isinstance(task, DrawnTask) else None,
+        "steps_per_second": pace(task),
         "people_seconds": people or None,
         "seconds": seconds | {"total": sum(seconds.values())},
         "source": origin.source,

@@ -65,10 +65,12 @@ def _wins(facts: Facts) -> list[str]:
 
 
 def _doubts(facts: Facts) -> list[str]:
-    """That the reward may know nothing yet, and what to do about it, in a sentence or none."""
-    known = facts.held_out
+    """That the reward may know nothing yet, and what to do about it, in a sentence; none where gold rose clearly."""
+    known, (before, after, _) = facts.held_out, facts.gold
     if known is None or known.value is None or known.low is None or known.low > 0.5:
         return []
+    if before is not None and after is not None and after > before and not _noise(facts, after - before):
+        return []  # it knew enough
     return [
         f"On {show_count(known.count, 'held-out comparison')} the reward is not clearly better than a coin "
         f"({show_share(known.value)} right): more labels tell, and so does how often two labelers agree."

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from prefrl.components import Settings
 from prefrl.config import Config
-from prefrl.protocols import DrawnTask
+from prefrl.evaluate.summary import pace
 from prefrl.report.costs import Spent
 from prefrl.store import Store
 
@@ -40,5 +40,6 @@ def estimate(config: Config) -> Spent:
     seconds = sum(one.get(f"seconds/{stage}", 0.0) * factor for stage, factor in growth.items())
     steps = {"learn": growth["improve"], "query": growth["sample"], "evaluate": evaluations / 2}  # of the two in `one`
     spent = sum(one.get(f"steps/{purpose}", 0.0) * factor for purpose, factor in steps.items())
-    rate = loop.task.fps if isinstance(loop.task, DrawnTask) else None
-    return Spent(round(spent), rate, config.loop.labels, None, seconds + start["seconds/evaluate"] * evaluations)
+    return Spent(
+        round(spent), pace(loop.task), config.loop.labels, None, seconds + start["seconds/evaluate"] * evaluations
+    )

@@ -106,6 +106,9 @@ def test_a_reward_that_may_be_a_coin_is_said_to_be_one(
     )
     told = "On 20 held-out comparisons the reward is not clearly better than a coin (60\N{NO-BREAK SPACE}% right)"
     assert (told in verdict(gather(read(tmp_path)))) is warned
+    gold = {"gold_before": 0.1, "gold_after": 0.9, "gold_best": 0.9}  # it knew enough
+    (tmp_path / "summary.json").write_text(json.dumps(gold))
+    assert told not in verdict(gather(read(tmp_path)))
 
 
 @pytest.mark.parametrize("wild", [None, "x", -1e308, 10**400, [1], {"value": "NaN"}, {"value": 1e300}])

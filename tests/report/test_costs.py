@@ -5,6 +5,8 @@ from pathlib import Path
 
 from run_folders import folder_of_run
 
+from prefrl import Config
+from prefrl.evaluate.summary import pace
 from prefrl.report.chapters import chapters
 from prefrl.report.costs import Spent, account, costs
 from prefrl.report.facts import gather
@@ -55,3 +57,8 @@ def test_a_report_leaves_waiting_for_people_out_of_the_machine(tmp_path: Path) -
 def test_what_is_known_of_no_world_is_not_made_up(tmp_path: Path) -> None:
     assert "world:" not in outside(tmp_path / "old")
     assert outside(tmp_path / "nothing", labels={"asked": 0, "answered": 0, "skipped": 0}) == ""
+
+
+def test_only_what_goes_step_by_step_has_a_pace() -> None:
+    paces = {name: pace(Config.load(name).build_task()) for name in ("control/toy", "text/toy", "pictures/digits")}
+    assert paces == {"control/toy": 10.0, "text/toy": None, "pictures/digits": None}
