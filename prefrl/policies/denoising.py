@@ -20,7 +20,6 @@ from rich.console import Console
 from torch import Tensor
 
 from prefrl.components import Settings
-from prefrl.fit.adam import Adam
 from prefrl.policies.denoiser import Denoiser
 from prefrl.seeding import draw_seed, generator, threads
 from prefrl.storage.checkpoints import load_state, save_state
@@ -86,7 +85,7 @@ class DenoiserSettings(Settings):
         """The averaged weights, those of captions left out."""
         model, order = self._empty(pixels.shape[1], 1), generator(np.random.default_rng(self.seed))
         shown = torch.from_numpy(np.ascontiguousarray(pixels, np.float32))
-        optimizer = Adam([{"params": list(model.parameters())}], self.learning_rate)
+        optimizer = torch.optim.Adam(model.parameters(), self.learning_rate, fused=True)
         kept = {name: value.detach().clone() for name, value in model.named_parameters()}
         Console(stderr=True).print(f"training a denoiser on {len(shown)} pictures (once; it is kept)", soft_wrap=True)
         with threads(1):

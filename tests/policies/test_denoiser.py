@@ -51,6 +51,8 @@ def test_a_step_is_a_gaussian_whose_probability_and_kl_are_exact(policy: Denoise
         expected = ours.log_prob(chains.states[:, at + 1].double()).sum(1)  # type: ignore[no-untyped-call]
         torch.testing.assert_close(logp[:, at].double(), expected, atol=1e-3, rtol=1e-4)
         torch.testing.assert_close(kl[:, at].double(), kl_divergence(ours, start).sum(1), atol=1e-3, rtol=1e-3)
+        scaled = (chains.states[:, at + 1].double() - ours.mean) / ours.stddev
+        assert float(scaled.square().mean()) == pytest.approx(1.0, abs=0.15)
     assert kl.min() > 0.01
     torch.testing.assert_close(policy.kl(chains), kl)
 

@@ -74,9 +74,11 @@ export class Clip extends EventTarget {
 
   /** Draw the picture as it is now onto a small canvas. */
   draw(canvas) {
-    if (!this.#video || this.#video.readyState < 2) return;
+    const source = this.#video ?? this.element.querySelector("img");
+    const there = this.#video ? this.#video.readyState >= 2 : source?.complete;
+    if (!there) return;
     const [width, height] = [canvas.width, canvas.width / this.shape];
-    canvas.getContext("2d").drawImage(this.#video, 0, (canvas.height - height) / 2, width, height);
+    canvas.getContext("2d").drawImage(source, 0, (canvas.height - height) / 2, width, height);
   }
 
   /** Done when the picture is there. */
