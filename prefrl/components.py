@@ -105,6 +105,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "cpl": "prefrl.improve.cpl:CPLSettings",
         "dpo": "prefrl.improve.dpo:DPOSettings",
+        "dyna": "prefrl.improve.dyna:DynaSettings",
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
