@@ -28,6 +28,8 @@ from prefrl.policies.rollout import Rollout
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Bools, Floats, Integers, Metrics, State
 
+BLOCK = 20
+"""Steps that are held out together, one after another; fewer of a short play."""
 CHECKS = 20
 """How often in a fit the held-out loss is looked at."""
 MARGIN = 0.1
@@ -85,8 +87,12 @@ class Transitions:
 
     @classmethod
     def of(cls, rollout: Rollout, share: float, rng: np.random.Generator) -> Transitions:
-        """All steps of a rollout, a share of them held out for good. Raises `ConfigError` where not all actions are
-        always legal: a learned world does not know which are."""
+        """The steps of a rollout, a share of them held out for good, in blocks: a step whose neighbours were learned
+        from is no test. Of what lies still, each action is kept once in each place: else the rest that follows an early
+        end would be most of what is learned.
+
+        Raises `ConfigError` where not all actions are always legal: a learned world does not know which are.
+        """
         if rollout.legal is not None:
             raise ConfigError(
                 "a learned world does not know which actions are legal, and in this task not all of them always are: "
@@ -94,9 +100,17 @@ class Transitions:
             )
         rows = (rollout.observations, rollout.actions, rollout.final_observations)
         seen, done, following = (x.reshape(-1, x.shape[2]) for x in rows)
-        terminated, held_out = rollout.terminated.ravel(), np.zeros(len(seen), bool)
-        held_out[rng.permutation(len(seen))[: max(1, round(share * len(seen)))]] = True
-        return cls(seen, done.astype(np.float32), following, terminated, held_out)
+        still = np.flatnonzero((seen == following).all(1))
+        _, first = np.unique(np.concatenate([seen, done], 1)[still], axis=0, return_index=True)
+        kept = np.setdiff1d(np.arange(len(seen)), np.delete(still, first))
+        columns = seen, done.astype(np.float32), following, rollout.terminated.ravel(), _blocks(rollout, share, rng)
+        return cls(*(column[kept] for column in columns))
+
+    @property
+    def starts(self) -> Floats:
+        """(M, O): where something moves on from; all, where nothing does."""
+        moves = (self.observations != self.following).any(1)
+        return self.observations[moves] if moves.any() else self.observations
 
     def joined(self, other: Transitions) -> Transitions:
         return Transitions(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
@@ -302,6 +316,18 @@ class World:
         margin = MARGIN * (high - low)
         sides = {"low": low - margin, "high": high + margin}
         return found | {name: torch.from_numpy(x).to(inputs.device) for name, x in sides.items()}
+
+
+def _blocks(rollout: Rollout, share: float, rng: np.random.Generator) -> Bools:
+    """(n T,): the steps of some blocks, drawn among all that there are in which something moves."""
+    rows, steps = rollout.ends.shape
+    length = min(BLOCK, max(1, int(share * rows * steps)))  # a short play is not to be held out whole
+    block = np.arange(rows)[:, None] * steps + np.arange(steps) // length
+    moves = (rollout.observations != rollout.final_observations).any(2)
+    blocks = np.unique(block[moves] if moves.any() else block)
+    chosen = rng.permutation(blocks)[: max(1, round(share * len(blocks)))]
+    found: Bools = np.isin(block, chosen).ravel()
+    return found
 
 
 def _std(rows: Tensor) -> Tensor:

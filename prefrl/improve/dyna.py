@@ -21,14 +21,16 @@ from prefrl.envs.learned import Transitions, World, WorldSettings
 from prefrl.improve.control import ControlLearnerSettings
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Actor, played
-from prefrl.policies.rollout import Act, Rollout, collect, learned_rewards, step_rewards, whole_episodes
+from prefrl.policies.rollout import Rollout, collect, learned_rewards, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
-from prefrl.sample.segments import first_rollout
+from prefrl.sample.segments import cut, first_rollout, placed, windows
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 OUTSIDE = ("evaluation_episodes", "device", "threads")
 """Settings of the learner inside that are said outside of it."""
+PLAYS = 4
+"""So many rounds' real episodes are kept to be asked about."""
 AWAKE = (
     "the learned world is not to be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
     "observation, {held_out:.0%} of the variance of the changes) leaves no step to imagine; the run has stopped "
@@ -109,6 +111,9 @@ class Dyna:
         self._inside = inside.build(DreamtTask(task, self._dream), rng)
         self._player = Player(task, settings.inside.environments)
         self._real: Transitions | None = None
+        self._plays: list[Rollout] = []
+        """The newest real episodes, oldest first."""
+        self._played = 0
         self._fresh = False
         """Whether the newest real episodes were not learned from yet."""
         self._notes: tuple[str, ...] = ()
@@ -120,15 +125,24 @@ class Dyna:
         return self._player.steps.add(imagined=self._inside.steps.learn + self._checked)
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
-        """Segments of real episodes of the policy as it is; the world learns from these as well."""
-        if not self._player.moved:
-            act = self._exploring(rng)
-            rollout = first_rollout(self._task, act, count, self._settings.inside.environments, rng)
-            self._player.explored(rollout)
-            self._learn_from(rollout, rng)
+        """Segments of real episodes of the policy as it is; the world learns from these as well.
+
+        Where they hold fewer segments than that, the others are of the episodes before. Raises ValueError where there
+        are none of that either.
+        """
+        if not self._plays:
+            act, most = played(self.actor(), rng), self._settings.inside.environments
+            self._learn_from(first_rollout(self._task, act, count, most, rng), rng)
         elif not self._fresh:
             self._play(rng)
-        return self._player.sample(count, self._exploring(rng), rng)
+        length, found = self._task.segment_steps, list[Segment]()
+        for back, rollout in enumerate(reversed(self._plays)):
+            held = len(windows(rollout, length)[0]) if back + 1 < len(self._plays) else count
+            name = f"play {self._played - back}"
+            found = cut(rollout, length, min(held, count - len(found)), name, rng) + found
+            if len(found) == count:
+                break
+        return placed(self._task, found)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then let the policy learn in it.
@@ -144,7 +158,7 @@ class Dyna:
         if not self.world.reach:
             self._notes = (AWAKE.format(error=self.world.error, held_out=self.world.held_out),)
             return found | {"branch": 0.0}
-        self._dream.starts = self._real.observations
+        self._dream.starts = self._real.starts
         self._dream.lengths.clear()
         inside = self._inside.improve(reward, store, rng)
         return inside | found | {"branch": float(np.mean(self._dream.lengths or [self.world.reach]))}
@@ -172,24 +186,23 @@ class Dyna:
     def state(self) -> State:
         real = None if self._real is None else self._real.state()
         own = {"real": real, "fresh": self._fresh, "checked": self._checked, "world": self.world.state()}
+        own |= {"plays": [one.state() for one in self._plays], "played": self._played}
         return own | {"inside": self._inside.state(), "player": self._player.state()}
 
     def load(self, state: State) -> None:
         self._real = None if state["real"] is None else Transitions(**state["real"])
-        self._fresh, self._checked = state["fresh"], state["checked"]
+        self._fresh, self._checked, self._played = state["fresh"], state["checked"], state["played"]
+        self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
         self._inside.load(state["inside"])
         self._player.load(state["player"])
 
-    def _exploring(self, rng: np.random.Generator) -> Act:
-        return played(self.actor(), rng)
-
     def _play(self, rng: np.random.Generator) -> None:
-        rollout = whole_episodes(self._task, self._exploring(rng), self._settings.episodes, rng)
-        self._player.learned_from(rollout)
-        self._learn_from(rollout, rng)
+        self._learn_from(whole_episodes(self._task, played(self.actor(), rng), self._settings.episodes, rng), rng)
 
     def _learn_from(self, rollout: Rollout, rng: np.random.Generator) -> None:
+        self._player.steps = self._player.steps.add(learn=rollout.ends.size)
+        self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
         new = Transitions.of(rollout, self._settings.world.held_out, rng)
         self._real = new if self._real is None else self._real.joined(new)
         self._fresh = True
