@@ -157,6 +157,10 @@ class World:
         return self.settings.members
 
     @property
+    def device(self) -> torch.device:
+        return self._layers[0].device
+
+    @property
     def fitted(self) -> bool:
         return math.isfinite(self.held_out)
 
@@ -182,7 +186,7 @@ class World:
     @torch.no_grad()
     def imagine(self, observations: Floats, actions: Floats, members: Integers) -> Imagined:
         """One step of n branches, each by one of the members (n,)."""
-        device, rows = self._layers[0].device, torch.from_numpy(members)
+        device, rows = self.device, torch.from_numpy(members)
         parts = []
         for at in np.array_split(np.arange(len(members)), -(-len(members) // PIECE)):
             seen, done = (torch.from_numpy(x[at]).to(device) for x in (observations, actions))
@@ -288,8 +292,7 @@ class World:
     def _raw(self, data: Transitions, at: Bools) -> tuple[Tensor, Tensor]:
         inputs = np.concatenate([data.observations[at], data.actions[at]], 1)
         changes = np.column_stack([data.following[at] - data.observations[at], data.terminated[at]])
-        device = self._layers[0].device
-        return torch.from_numpy(inputs).to(device), torch.from_numpy(changes.astype(np.float32)).to(device)
+        return torch.from_numpy(inputs).to(self.device), torch.from_numpy(changes.astype(np.float32)).to(self.device)
 
     @torch.no_grad()
     def _rebase(self, data: Transitions) -> None:

@@ -109,6 +109,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "iql": "prefrl.improve.iql:IQLSettings",
         "kto": "prefrl.improve.kto:KTOSettings",
         "online_dpo": "prefrl.improve.online_dpo:OnlineDPOSettings",
+        "planner": "prefrl.improve.planner:PlannerSettings",
         "q_learning": "prefrl.improve.q_learning:QLearningSettings",
         "raft": "prefrl.improve.raft:RAFTSettings",
         "sb3": "prefrl.improve.sb3:SB3Settings",

@@ -17,26 +17,18 @@ from pydantic import Field, model_validator
 
 from prefrl.components import Settings
 from prefrl.envs.imagined import Branches, Dream, DreamtTask
-from prefrl.envs.learned import Transitions, World, WorldSettings
+from prefrl.envs.learned import WorldSettings
 from prefrl.improve.control import ControlLearnerSettings
+from prefrl.improve.grounded import Grounded
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Actor, played
-from prefrl.policies.rollout import Rollout, collect, learned_rewards, step_rewards, whole_episodes
+from prefrl.policies.rollout import collect, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
-from prefrl.sample.segments import cut, first_rollout, placed, windows
 from prefrl.seeding import Device, device_of
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
 OUTSIDE = ("evaluation_episodes", "device", "threads")
 """Settings of the learner inside that are said outside of it."""
-PLAYS = 4
-"""So many rounds' real episodes are kept to be asked about."""
-AWAKE = (
-    "the learned world is not to be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
-    "observation, {held_out:.0%} of the variance of the changes) leaves no step to imagine; the run has stopped "
-    "dreaming, and its policy stays as it is until the world is better: raise learner.episodes, so that it sees more, "
-    "or learner.world.tolerance"
-)
 
 
 class DynaSettings(Settings):
@@ -104,25 +96,17 @@ class Dyna:
 
     def __init__(self, settings: DynaSettings, task: ControlTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
-        sizes = task.observation_size, task.action_size
-        self.world = World(settings.world, sizes, device_of(settings.device), rng)
-        self._dream = Dream(self.world)
+        self.ground = Grounded(settings.world, task, device_of(settings.device), rng)
+        self._dream = Dream(self.ground.world)
         inside = settings.inside.model_copy(update={"device": settings.device})
         self._inside = inside.build(DreamtTask(task, self._dream), rng)
         self._player = Player(task, settings.inside.environments)
-        self._real: Transitions | None = None
-        self._plays: list[Rollout] = []
-        """The newest real episodes, oldest first."""
-        self._played = 0
-        self._fresh = False
-        """Whether the newest real episodes were not learned from yet."""
-        self._notes: tuple[str, ...] = ()
         self._checked = 0
         """Steps that were imagined to be held against real ones."""
 
     @property
     def steps(self) -> Steps:
-        return self._player.steps.add(imagined=self._inside.steps.learn + self._checked)
+        return self._player.steps.add(learn=self.ground.spent, imagined=self._inside.steps.learn + self._checked)
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of real episodes of the policy as it is; the world learns from these as well.
@@ -130,19 +114,11 @@ class Dyna:
         Where they hold fewer segments than that, the others are of the episodes before. Raises ValueError where there
         are none of that either.
         """
-        if not self._plays:
-            act, most = played(self.actor(), rng), self._settings.inside.environments
-            self._learn_from(first_rollout(self._task, act, count, most, rng), rng)
-        elif not self._fresh:
+        if not self.ground.begun:
+            self.ground.begin(count, played(self.actor(), rng), self._settings.inside.environments, rng)
+        elif not self.ground.fresh:
             self._play(rng)
-        length, found = self._task.segment_steps, list[Segment]()
-        for back, rollout in enumerate(reversed(self._plays)):
-            held = len(windows(rollout, length)[0]) if back + 1 < len(self._plays) else count
-            name = f"play {self._played - back}"
-            found = cut(rollout, length, min(held, count - len(found)), name, rng) + found
-            if len(found) == count:
-                break
-        return placed(self._task, found)
+        return self.ground.segments(count, rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then let the policy learn in it.
@@ -150,28 +126,25 @@ class Dyna:
         Metrics: those of the world's fit (`World.fit`), of the learner inside, and branch, the mean length of imagined
         branches in steps. Where nothing can be imagined the policy stays as it is, and a note says so.
         """
-        if not self._fresh:
+        if not self.ground.fresh:
             self._play(rng)
-        assert self._real is not None
-        found = self.world.fit(self._real, rng)
-        self._fresh, self._notes = False, ()
-        if not self.world.reach:
-            self._notes = (AWAKE.format(error=self.world.error, held_out=self.world.held_out),)
+        found = self.ground.learn(rng)
+        if not self.ground.world.reach or self.ground.data is None:
             return found | {"branch": 0.0}
-        self._dream.starts = self._real.starts
+        self._dream.starts = self.ground.data.starts
         self._dream.lengths.clear()
         inside = self._inside.improve(reward, store, rng)
-        return inside | found | {"branch": float(np.mean(self._dream.lengths or [self.world.reach]))}
+        return inside | found | {"branch": float(np.mean(self._dream.lengths or [self.ground.world.reach]))}
 
     def evaluate(self, reward: RewardModel[Segment], rng: np.random.Generator) -> Evaluation[Segment]:
         """The policy's mode in real episodes; and `imagined`, what the same policy gets of the learned reward in the
         world, from the same first states, for as many steps: beside `learned`, which is the real one."""
         found = self._player.evaluate(self._settings.evaluation_episodes, played(self.actor(), None), reward, rng)
         metrics = dict(found.metrics)
-        if self.world.fitted and reward.fitted:
+        if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
             metrics["imagined"] = float(self._imagined(starts, reward, rng).mean())
-        return replace(found, metrics=metrics, notes=(*found.notes, *self._notes))
+        return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
     def pace(self, begin: float, end: float) -> None:
         self._inside.pace(begin, end)
@@ -184,34 +157,22 @@ class Dyna:
         self._inside.save(path)
 
     def state(self) -> State:
-        real = None if self._real is None else self._real.state()
-        own = {"real": real, "fresh": self._fresh, "checked": self._checked, "world": self.world.state()}
-        own |= {"plays": [one.state() for one in self._plays], "played": self._played}
-        return own | {"inside": self._inside.state(), "player": self._player.state()}
+        parts = {"ground": self.ground.state(), "inside": self._inside.state(), "player": self._player.state()}
+        return parts | {"checked": self._checked}
 
     def load(self, state: State) -> None:
-        self._real = None if state["real"] is None else Transitions(**state["real"])
-        self._fresh, self._checked, self._played = state["fresh"], state["checked"], state["played"]
-        self._plays = [Rollout(**one) for one in state["plays"]]
-        self.world.load(state["world"])
+        self.ground.load(state["ground"])
         self._inside.load(state["inside"])
         self._player.load(state["player"])
+        self._checked = state["checked"]
 
     def _play(self, rng: np.random.Generator) -> None:
-        self._learn_from(whole_episodes(self._task, played(self.actor(), rng), self._settings.episodes, rng), rng)
-
-    def _learn_from(self, rollout: Rollout, rng: np.random.Generator) -> None:
-        self._player.steps = self._player.steps.add(learn=rollout.ends.size)
-        self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
-        new = Transitions.of(rollout, self._settings.world.held_out, rng)
-        self._real = new if self._real is None else self._real.joined(new)
-        self._fresh = True
+        self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)
 
     def _imagined(self, starts: Floats, reward: RewardModel[Segment], rng: np.random.Generator) -> Floats:
         """(n,) learned returns of whole imagined episodes of the policy's mode."""
         branches = Branches(replace(self._dream, starts=starts, lengths=[]), len(starts), self._task.horizon)
-        act = played(self.actor(), None)
-        rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, act)
+        rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, played(self.actor(), None))
         self._checked += rollout.ends.size
         going = rollout.ends.cumsum(1) - rollout.ends == 0  # up to the first end, which counts
         worth: Floats = np.where(going, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)

@@ -84,7 +84,7 @@ def test_gold_never_touches_what_is_learned(store: Store[Segment]) -> None:
         learner = dyna(point(hide_gold=hide), inside=INSIDE | {"steps_per_round": 200})
         rounds(learner, store, range(2))
         state = learner.state()
-        for one in state["plays"]:
+        for one in state["ground"]["plays"]:
             del one["gold"]  # of what was done, for oracles
         state["inside"]["recent"].pop("gold")
         states.append([*leaves(state)])
@@ -106,9 +106,9 @@ def test_a_run_says_that_it_has_stopped_dreaming_and_goes_on_when_the_world_is_b
     learner = dyna()
     rounds(learner, store, range(3))
     acted = learner.actor()(np.linspace(-1, 1, 9, dtype=np.float32)[:, None], None, None)[0]
-    real = learner._real
+    real = learner.ground.data
     assert real is not None
-    learner._real = replace(real, following=np.random.default_rng(0).permutation(real.following))
+    learner.ground.data = replace(real, following=np.random.default_rng(0).permutation(real.following))
     metrics = learner.improve(Known(), store, np.random.default_rng(1))
     assert (metrics["reach"], metrics["branch"]) == (0, 0)
     assert learner.steps.imagined == 2400
@@ -116,7 +116,7 @@ def test_a_run_says_that_it_has_stopped_dreaming_and_goes_on_when_the_world_is_b
     assert acted.tobytes() == still.tobytes()
     (note,) = learner.evaluate(Known(), np.random.default_rng(2)).notes
     assert "has stopped dreaming" in note
-    learner._real = real
+    learner.ground.data = real
     assert learner.improve(Known(), store, np.random.default_rng(3))["reach"] > 10
     assert not learner.evaluate(Known(), np.random.default_rng(2)).notes
 
