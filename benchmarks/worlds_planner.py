@@ -6,7 +6,9 @@
 Each seed runs the preset; then 20 episodes are planned, with the last world and the last reward, and scored by the true
 reward. `gold` is the mean over seeds and `worst` the lowest; `real_steps` are those that were asked about and learned
 from, and `imagined_steps` those that plans were tried in; `cpu_s` is the most CPU seconds of any seed, evaluations
-included, and `evaluation_cpu_s` those of the 20 episodes. The last line is one JSON object.
+included, and `evaluation_cpu_s` those of the 20 episodes. With `--preset control/gridworld-planner` also `agreement`: in
+what share of the states the tree search takes an action of value iteration's on the same learned world and reward; and
+`regret`, of a span of the true returns. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
+
+import numpy as np
 
 EPISODES = 20
 
@@ -42,7 +46,9 @@ def one_run(preset: str, seed: int, settings: Sequence[str]) -> dict[str, Any]:
     import torch
 
     from prefrl.config import Config
-    from prefrl.improve.planner import Planner, PlannerSettings
+    from prefrl.improve.planner import PlannerSettings
+    from prefrl.improve.tree import TreePlanner
+    from prefrl.policies.rollout import step_rewards
     from prefrl.seeding import streams
     from prefrl.store import Store
     from prefrl.types import Segment
@@ -52,8 +58,10 @@ def one_run(preset: str, seed: int, settings: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, Store[Segment](Path(folder) / "store") as store:
         loop = config.build(store)
         *_, last = loop.run()
+    if isinstance(loop.learner, TreePlanner):
+        return of_tree(loop.learner, last.metrics, step_rewards(loop.reward), time.process_time() - begin)
     many = cast(PlannerSettings, config.learner).model_copy(update={"evaluation_episodes": EPISODES})
-    planner: Planner = many.build(config.build_task(), streams(seed, 0).build)
+    planner = many.build(config.build_task(), streams(seed, 0).build)
     planner.load(loop.learner.state())
     measuring = time.process_time()
     found = planner.evaluate(loop.reward, streams(seed, 0).evaluate).metrics
@@ -61,6 +69,22 @@ def one_run(preset: str, seed: int, settings: Sequence[str]) -> dict[str, Any]:
     steps = {"real_steps": int(metrics["steps/learn"]), "imagined_steps": int(metrics["steps/imagined"])}
     costs = {"cpu_s": round(now - begin, 1), "evaluation_cpu_s": round(now - measuring, 1)}
     return {"gold": round(found["gold"], 1), "labels": int(metrics["label/asked"]), **steps, **costs}
+
+
+def of_tree(planner: Any, metrics: dict[str, float], reward: Any, cpu: float) -> dict[str, Any]:
+    """What a tree search came to, and in what share of the states it takes an action of value iteration's on the world
+    as it was learned, by the learned reward; its values are those of the last search."""
+    from prefrl.envs import exact
+    from prefrl.envs.tabular import GridworldSettings
+
+    best = exact.value_iteration(planner.learned(reward))
+    taken = best[np.arange(len(best)), planner.values.argmax(1)]
+    true = GridworldSettings().world().mdp
+    steps = {"real_steps": int(metrics["steps/learn"]), "imagined_steps": int(metrics["steps/imagined"])}
+    said = {"gold": round(metrics["evaluate/gold"], 2), "labels": int(metrics["label/asked"]), "cpu_s": round(cpu, 1)}
+    agreement = round(float((taken >= best.max(1) - 1e-6).mean()), 3)
+    regret = round(exact.regret(true, exact.greedy(planner.values)), 4)
+    return {**said, **steps, "evaluation_cpu_s": 0.0, "agreement": agreement, "regret": regret}
 
 
 def said(preset: str, settings: Sequence[str], runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -79,6 +103,7 @@ def said(preset: str, settings: Sequence[str], runs: Sequence[dict[str, Any]]) -
         "worst": min(golds),
         **{name: max(run[name] for run in runs) for name in most},
         "golds": golds,
+        **{name: [run[name] for run in runs] for name in ("agreement", "regret") if name in runs[0]},
     }
 
 

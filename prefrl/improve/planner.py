@@ -1,5 +1,7 @@
 """Planning in a learned world by the learned reward, without a policy: CEM and MPPI over sequences of actions.
 
+Discrete actions are planned by `prefrl.improve.tree`.
+
 Variant: PETS's model-predictive control (Chua et al. 2018, algorithm 1): in each step sequences of actions are drawn,
 each is followed by one member of the ensemble, and the first action of what did best is executed. `cem` fits a
 Gaussian to the best sequences, some times over (Rubinstein and Kroese 2004); `mppi` weighs all by the exponential of
@@ -12,6 +14,7 @@ end of a plan.
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Literal
 
 import numpy as np
@@ -22,25 +25,31 @@ from prefrl.components import ConfigError, Settings, filled_in
 from prefrl.envs.learned import World, WorldSettings
 from prefrl.improve.grounded import Grounded
 from prefrl.improve.player import Player
+from prefrl.improve.tree import TreePlanner, TreeSearch
 from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.rollout import step_rewards
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, to_numpy
 from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
 
-ALGORITHMS: dict[str, dict[str, object]] = {"cem": {}, "mppi": {"iterations": 1, "candidates": 500}}
+ALGORITHMS: dict[str, dict[str, object]] = {
+    "cem": {},
+    "mppi": {"iterations": 1, "candidates": 500},
+    "mcts": {"plan": 80, "discount": 0.95, "episodes": 16},
+}
 """Where their defaults are others than those of the fields below."""
 NARROWEST = 0.05
 """The least standard deviation that cem draws with, as a share of `std`."""
 
 
 class PlannerSettings(Settings):
-    """Planning in a learned world by the learned reward, for continuous actions; there is no policy."""
+    """Planning in a learned world by the learned reward; there is no policy."""
 
     kind: Literal["planner"] = "planner"
-    algorithm: Literal["cem", "mppi"] = "cem"
-    """What fills in the defaults: cem fits a Gaussian to the best sequences, over and over; mppi weighs all of many by
-    their returns, once."""
+    algorithm: Literal["cem", "mppi", "mcts"] = "cem"
+    """What fills in the defaults. For continuous actions: cem fits a Gaussian to the best sequences, over and over;
+    mppi weighs all of many by their returns, once. For discrete actions in states that are seen one-hot: mcts, a tree
+    search in transitions that are counted."""
     world: WorldSettings = WorldSettings()
     """The ensemble of dynamics."""
     episodes: int = Field(1, ge=1)
@@ -58,7 +67,13 @@ class PlannerSettings(Settings):
     """mppi: by which differences of returns are divided, in standard deviations of them; low follows the best alone."""
     std: float = Field(0.5, gt=0)
     """What sequences are drawn with first, in halves of the range of an action."""
-    discount: float = Field(0.99, gt=0, le=1)
+    simulations: int = Field(1000, ge=1)
+    """mcts: ways that are tried from each state, in each round."""
+    exploration: float = Field(0.3, ge=0)
+    """mcts: weight of the bonus for actions that were tried seldom, in spans of what can be gained."""
+    epsilon: float = Field(0.2, ge=0, le=1)
+    """mcts: how often an action is random in real episodes. Evaluations are greedy."""
+    discount: float = Field(0.99, gt=0, lt=1)
     """What a reward a step later counts for in a plan."""
     evaluation_episodes: int = Field(5, ge=1)
     """Real episodes of an evaluation, side by side; each step of each is planned, which takes its time."""
@@ -73,7 +88,14 @@ class PlannerSettings(Settings):
         return filled_in(given, ALGORITHMS)
 
     def shrunk(self) -> PlannerSettings:
-        least = {"candidates": 10, "iterations": 1, "plan": min(self.plan, 3), "evaluation_episodes": 1, "episodes": 1}
+        least = {
+            "candidates": 10,
+            "iterations": 1,
+            "simulations": 2,
+            "plan": min(self.plan, 3),
+            "evaluation_episodes": 1,
+            "episodes": 1,
+        }
         return self.model_copy(update={**least, "world": self.world.shrunk()})
 
     def with_evaluation_of(self, other: PlannerSettings) -> PlannerSettings:
@@ -82,11 +104,20 @@ class PlannerSettings(Settings):
     def work(self) -> float:
         return float(self.plan * self.candidates * self.iterations)
 
-    def build(self, task: Task, rng: np.random.Generator) -> Planner:
-        """Raises `ConfigError` for actions that are discrete, or without bounds."""
-        return Planner(self, simulated(task, f"learner kind {self.kind!r} plays real episodes of control"), rng)
+    def build(self, task: Task, rng: np.random.Generator) -> Planner | TreePlanner:
+        """Raises `ConfigError` for actions, or states, that the algorithm is not for."""
+        found = simulated(task, f"learner kind {self.kind!r} plays real episodes of control")
+        if self.algorithm != "mcts":
+            return Planner(self, found, rng)
+        own = self.model_dump(include={one.name for one in fields(TreeSearch)})
+        return TreePlanner(TreeSearch(**own), found)
 
     def formula(self) -> str:
+        if self.algorithm == "mcts":
+            return (
+                f"Q_t(s,a) = r(s,a) + {self.discount:g} sum_s' p(s'|s,a) max Q_t+1(s',.),  t below {self.plan}\n"
+                f"p by counting; ways go by Q + {self.exploration:g} x span x sqrt(ln n(s) / n(s,a))"
+            )
         better = {
             "cem": f"mean and std of the best {self.elites:.0%} of {self.candidates} draws, {self.iterations} times",
             "mppi": f"mean of {self.candidates} sequences, weighted by exp(return / {self.temperature:g} std)",
@@ -174,7 +205,7 @@ def _bounds(task: ControlTask) -> tuple[Floats, Floats]:
     if task.action_bounds is None:
         raise ConfigError(
             f"learner.kind=planner draws sequences of continuous actions, and those of {task.name} are discrete: use "
-            "learner.kind=dyna"
+            "learner.kind=dyna, or learner.algorithm=mcts where states are seen one-hot"
         )
     if not all(np.isfinite(side).all() for side in task.action_bounds):
         raise ConfigError(f"learner.kind=planner draws actions within bounds, and those of {task.name} have none")
