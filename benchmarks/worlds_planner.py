@@ -6,9 +6,9 @@
 Each seed runs the preset; then 20 episodes are planned, with the last world and the last reward, and scored by the true
 reward. `gold` is the mean over seeds and `worst` the lowest; `real_steps` are those that were asked about and learned
 from, and `imagined_steps` those that plans were tried in; `cpu_s` is the most CPU seconds of any seed, evaluations
-included, and `evaluation_cpu_s` those of the 20 episodes. With `--preset control/gridworld-planner` also `agreement`: in
-what share of the states the tree search takes an action of value iteration's on the same learned world and reward; and
-`regret`, of a span of the true returns. The last line is one JSON object.
+included, and `evaluation_cpu_s` those of the 20 episodes. With `--preset control/gridworld-planner` also `agreement`,
+in what share of the states the tree search takes an action of value iteration's on the same learned world and reward,
+and `regret`, as a share of the span of true returns. The last line is one JSON object.
 """
 
 from __future__ import annotations

@@ -396,8 +396,8 @@ def _dreaming(record: Record) -> tuple[Card, ...]:
         Card(
             "Imagined and real return",
             plots.lines("imagined", at, both),
-            "The learned reward of the same policy from the same first states, in the learned world and in the real one. "
-            "Where the imagined one is far above, the policy lives on the world's mistakes.",
+            "The learned reward of the same policy from the same first states, in the learned world and in the real "
+            "one. Where the imagined one is far above, the policy lives on the world's mistakes.",
         ),
         Card(
             "Error of the learned world",
@@ -408,8 +408,8 @@ def _dreaming(record: Record) -> tuple[Card, ...]:
         Card(
             "Steps of an imagined branch",
             plots.lines("branches", at, [one for one in curves if _known(one.values)], zero=True),
-            f"{dreamt}A branch is cut where the members of the world disagree, and none is longer than its held-out error "
-            "allows.",
+            f"{dreamt}A branch is cut where the members of the world disagree, and none is longer than its held-out "
+            "error allows.",
         ),
     )
 
