@@ -103,8 +103,8 @@ class Transitions:
         still = np.flatnonzero((seen == following).all(1))
         _, first = np.unique(np.concatenate([seen, done], 1)[still], axis=0, return_index=True)
         kept = np.setdiff1d(np.arange(len(seen)), np.delete(still, first))
-        columns = seen, done.astype(np.float32), following, rollout.terminated.ravel(), _blocks(rollout, share, rng)
-        return cls(*(column[kept] for column in columns))
+        moves = seen[kept], done[kept].astype(np.float32), following[kept]
+        return cls(*moves, rollout.terminated.ravel()[kept], _blocks(rollout, share, rng)[kept])
 
     @property
     def starts(self) -> Floats:

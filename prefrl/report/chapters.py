@@ -391,7 +391,7 @@ def _dreaming(record: Record) -> tuple[Card, ...]:
     real = [r if i is not None else None for r, i in zip(record.series("evaluate/learned"), imagined, strict=True)]
     dreamt = "The run stopped dreaming where they have no steps. " if 0 in reach else ""
     curves = [Line(record.series("improve/branch"), "improve", "mean"), Line(reach, "muted", "most", "--")]
-    both = [Line(real, "learned", "real"), Line(imagined, "improve", "imagined", "--")] if _known(imagined) else []
+    both = [Line(real, "learned", "real"), Line(imagined, "sample", "imagined", "--")] if _known(imagined) else []
     return (
         Card(
             "Imagined and real return",

@@ -29,7 +29,9 @@ def store(tmp_path: Path) -> Store[Segment]:
 
 def planner(task: Any = None, **settings: Any) -> Planner:
     given = SMALL | {"world": WORLD} | settings
-    return PlannerSettings.model_validate(given).build(task or point(), np.random.default_rng(0))
+    found = PlannerSettings.model_validate(given).build(task or point(), np.random.default_rng(0))
+    assert isinstance(found, Planner)
+    return found
 
 
 def rounds(learner: Planner, store: Store[Segment], numbers: range) -> None:
