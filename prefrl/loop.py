@@ -186,7 +186,7 @@ class Loop(Generic[C]):
             "fit": fitted.metrics if fitted else {},
             "improve": improved,
             "evaluate": evaluated.metrics,
-            "steps": {name: float(n) for name, n in self.learner.steps._asdict().items()},
+            "steps": {name: float(n) for name, n in self.learner.steps.counted().items()},
             "seconds": self._seconds,
         }
         if not self.reward.fitted:

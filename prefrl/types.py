@@ -174,9 +174,15 @@ class Steps(NamedTuple):
     learn: int = 0
     query: int = 0
     evaluate: int = 0
+    imagined: int = 0
+    """Steps in a learned world: no `env.step`, and in none of the others."""
 
-    def add(self, learn: int = 0, query: int = 0, evaluate: int = 0) -> Steps:
-        return Steps(self.learn + learn, self.query + query, self.evaluate + evaluate)
+    def add(self, learn: int = 0, query: int = 0, evaluate: int = 0, imagined: int = 0) -> Steps:
+        return Steps(self.learn + learn, self.query + query, self.evaluate + evaluate, self.imagined + imagined)
+
+    def counted(self) -> dict[str, int]:
+        """By purpose; imagined ones only where there are any, since most learners have none."""
+        return {name: count for name, count in self._asdict().items() if count or name != "imagined"}
 
 
 @dataclass(frozen=True)

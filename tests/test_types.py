@@ -52,7 +52,7 @@ def test_gold_is_only_there_where_it_was_attached() -> None:
 
 
 def test_steps_add_up_by_purpose() -> None:
-    assert Steps(1, 2, 3).add(learn=10).add(query=20, evaluate=30) == (11, 22, 33)
+    assert Steps(1, 2, 3).add(learn=10).add(query=20, evaluate=30, imagined=4) == (11, 22, 33, 4)
 
 
 def test_no_two_responses_share_an_id_by_where_a_prompt_ends() -> None:

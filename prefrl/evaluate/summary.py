@@ -11,6 +11,7 @@ from prefrl.kinds import find
 from prefrl.protocols import DrawnTask, Task
 from prefrl.types import Json
 
+PURPOSES = ("learn", "query", "evaluate")
 STAGES = ("sample", "label", "fit", "improve", "evaluate")
 
 
@@ -64,6 +65,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: f
     gold = [row["evaluate/gold"] for row in rows if row.get("evaluate/gold") is not None]
     seconds = {stage: sum(row.get(f"seconds/{stage}") or 0.0 for row in rows) for stage in STAGES}
     counted = ("asked", "answered", "skipped", *(["demonstrations"] if "label/demonstrations" in last else []))
+    dreamt = ["imagined"] if "steps/imagined" in last else []
     accuracies = [row["fit/accuracy_held_out"] for row in rows if row.get("fit/accuracy_held_out") is not None]
     return {
         "task": task.name,
@@ -74,7 +76,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: f
         "gold_after": last.get("evaluate/gold"),
         "gold_best": max(gold, default=None),
         "labels": {name: int(last.get(f"label/{name}", 0)) for name in counted},
-        "steps": {name: int(last.get(f"steps/{name}", 0)) for name in ("learn", "query", "evaluate")},
+        "steps": {name: int(last.get(f"steps/{name}", 0)) for name in (*PURPOSES, *dreamt)},
         "reward_accuracy": accuracies[-1] if accuracies else None,
         "kl": last.get("evaluate/kl"),
         "fluency_before": first.get("evaluate/fluency"),

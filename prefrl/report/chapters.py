@@ -66,6 +66,7 @@ def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
         Chapter("Does it follow the expert?", _shifting(record)),
         Chapter("How far from the best?", _exactly(record)),
         Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
+        Chapter("Is its world like the real one?", _dreaming(record)),
         Chapter("How did it learn?", _training(record)),
         Chapter("What did it cost?", _cost(record, facts)),
     )
@@ -393,6 +394,38 @@ def _compounding(total: float, eps: float, steps: int) -> str:
         "With an error of eps at every step they are eps H; where one mistake spoils all that comes after it they are "
         f"about eps H²/2. After {show_count(steps, 'step')} the newest policy has {show_number(total)}, which is "
         f"{linear} times eps H and {square} times eps H²/2."
+    )
+
+
+def _dreaming(record: Record) -> tuple[Card, ...]:
+    """Of learners with a learned world."""
+    at, held, reach = record.numbers, record.series("improve/world_held_out"), record.series("improve/reach")
+    if not _known(held):
+        return ()
+    imagined = record.series("evaluate/imagined")
+    real = [r if i is not None else None for r, i in zip(record.series("evaluate/learned"), imagined, strict=True)]
+    dreamt = "The run stopped dreaming where they have no steps. " if 0 in reach else ""
+    curves = [Line(record.series("improve/branch"), "improve", "mean"), Line(reach, "muted", "most", "--")]
+    both = [Line(real, "learned", "real"), Line(imagined, "sample", "imagined", "--")] if _known(imagined) else []
+    return (
+        Card(
+            "Imagined and real return",
+            plots.lines("imagined", at, both),
+            "The learned reward of the same policy from the same first states, in the learned world and in the real "
+            "one. Where the imagined one is far above, the policy lives on the world's mistakes.",
+        ),
+        Card(
+            "Error of the learned world",
+            plots.lines("world", at, [Line(held, "muted")], zero=True),
+            "In real steps that no fit saw, as a share of the variance of what a step changes: 1 is a world that knows "
+            "no more than the mean.",
+        ),
+        Card(
+            "Steps of an imagined branch",
+            plots.lines("branches", at, [one for one in curves if _known(one.values)], zero=True),
+            f"{dreamt}A branch is cut where the members of the world disagree, and none is longer than its held-out "
+            "error allows.",
+        ),
     )
 
 

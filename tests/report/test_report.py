@@ -181,6 +181,20 @@ def test_rounds_that_were_undone_are_named_and_drawn(tmp_path: Path) -> None:
     assert "Undone" not in page(whole_run(tmp_path / "other")).text
 
 
+def test_a_learned_world_is_held_against_the_real_one(tmp_path: Path) -> None:
+    def dreamt(i: int, reach: float) -> dict[str, Any]:
+        world = {"improve/world_held_out": 0.1 / i, "improve/reach": reach, "improve/branch": 0.9 * reach}
+        return line(i, **world, **{"evaluate/imagined": 0.2 * i})
+
+    found = page(run_folder(tmp_path / "run", [line(0), dreamt(1, 20.0), dreamt(2, 30.0)], summary=summary()))
+    assert "Imagined and real return" in found.text
+    assert "Error of the learned world" in found.text
+    assert "stopped dreaming" not in found.text
+    asleep = page(run_folder(tmp_path / "other", [line(0), dreamt(1, 20.0), dreamt(2, 0.0)], summary=summary()))
+    assert "The run stopped dreaming where they have no steps." in asleep.text
+    assert "learned world" not in page(whole_run(tmp_path / "third")).text
+
+
 def test_without_gold_nothing_is_claimed(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/gold": float("nan"), "evaluate/gold_std": None}) for i in range(3)]
     missing = {"gold_before": None, "gold_after": None, "gold_best": None}

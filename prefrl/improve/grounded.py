@@ -1,0 +1,94 @@
+"""What learners with a learned world share: real episodes, which are asked about, and which the world learns from."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from prefrl.envs.learned import Transitions, World, WorldSettings
+from prefrl.policies.rollout import Act, Rollout, whole_episodes
+from prefrl.protocols import ControlTask
+from prefrl.sample.segments import cut, first_rollout, placed, windows
+from prefrl.types import Metrics, Segment, State
+
+PLAYS = 4
+"""So many rounds' real episodes are kept to be asked about."""
+AWAKE = (
+    "the learned world is not to be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
+    "observation, {held_out:.0%} of the variance of the changes) leaves no step to imagine; the run has stopped "
+    "dreaming, and its policy stays as it is until the world is better: raise learner.episodes, so that it sees more, "
+    "or learner.world.tolerance"
+)
+
+
+class Grounded:
+    """A world, and the real steps that it is learned from. `spent` counts them."""
+
+    def __init__(
+        self, settings: WorldSettings, task: ControlTask, device: torch.device, rng: np.random.Generator
+    ) -> None:
+        self._task = task
+        self.world = World(settings, (task.observation_size, task.action_size), device, rng)
+        self.data: Transitions | None = None
+        self.fresh = False
+        """Whether the newest real episodes were not learned from yet."""
+        self.spent = 0
+        self.notes: tuple[str, ...] = ()
+        """What people should know of the last fit."""
+        self._plays: list[Rollout] = []
+        """The newest real episodes, oldest first."""
+        self._played = 0
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything was played."""
+        return self._played > 0
+
+    def begin(self, count: int, act: Act, most: int, rng: np.random.Generator) -> None:
+        """Play as many episodes, of at most `most` environments, as hold so many segments."""
+        self._keep(first_rollout(self._task, act, count, most, rng), rng)
+
+    def play(self, episodes: int, act: Act, rng: np.random.Generator) -> None:
+        self._keep(whole_episodes(self._task, act, episodes, rng), rng)
+
+    def segments(self, count: int, rng: np.random.Generator) -> list[Segment]:
+        """Segments of the newest play, oldest first; where it holds fewer, the others are of the plays before.
+
+        Raises ValueError where there are none of that either.
+        """
+        length, found = self._task.segment_steps, list[Segment]()
+        for back, rollout in enumerate(reversed(self._plays)):
+            held = len(windows(rollout, length)[0]) if back + 1 < len(self._plays) else count
+            name = f"play {self._played - back}"
+            found = cut(rollout, length, min(held, count - len(found)), name, rng) + found
+            if len(found) == count:
+                break
+        return placed(self._task, found)
+
+    def learn(self, rng: np.random.Generator) -> Metrics:
+        """Fit the world on all real steps; the metrics are `World.fit`'s. A note says where it is not to be trusted."""
+        assert self.data is not None
+        metrics = self.world.fit(self.data, rng)
+        note = AWAKE.format(error=self.world.error, held_out=self.world.held_out)
+        self.fresh, self.notes = False, () if self.world.reach else (note,)
+        return metrics
+
+    def state(self) -> State:
+        data = None if self.data is None else self.data.state()
+        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played}
+        return counted | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
+
+    def load(self, state: State) -> None:
+        self.data = None if state["data"] is None else Transitions(**state["data"])
+        self.fresh, self.spent, self._played = state["fresh"], state["spent"], state["played"]
+        self._plays = [Rollout(**one) for one in state["plays"]]
+        self.world.load(state["world"])
+
+    def _keep(self, rollout: Rollout, rng: np.random.Generator) -> None:
+        new = Transitions.of(rollout, self.world.settings.held_out, rng)
+        self.data = new if self.data is None else self.data.joined(new)
+        self.fresh, self.spent = True, self.spent + rollout.ends.size
+        self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
+
+
+__all__ = ["Grounded"]
