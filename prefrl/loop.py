@@ -17,7 +17,7 @@ from pydantic import Field
 from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
-from prefrl.protocols import Imitates, Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
+from prefrl.protocols import Examined, Imitates, Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
 from prefrl.seeding import Streams, streams, threads
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
@@ -181,8 +181,9 @@ class Loop(Generic[C]):
 
     def _finish(self, number: int, improved: Metrics, evaluated: Evaluation[C], fitted: Fitted | None) -> Round[C]:
         """Gather the round's numbers, and count it as done."""
+        of_itself = self.labeler.metrics if isinstance(self.labeler, Examined) else {}
         stages: dict[str, Metrics] = {
-            "label": {name: float(n) for name, n in self.store.counts().items()},
+            "label": {name: float(n) for name, n in self.store.counts().items()} | of_itself,
             "fit": fitted.metrics if fitted else {},
             "improve": improved,
             "evaluate": evaluated.metrics,

@@ -372,6 +372,15 @@ class Advises(Protocol):
         """Whether it does not do so in all of its own episodes, and so is no measure."""
 
 
+@runtime_checkable
+class Examined(Protocol):
+    """A labeler that measures itself while it answers, as a judge that is asked in both orders."""
+
+    @property
+    def metrics(self) -> Metrics:
+        """Of its newest answers, by name."""
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 

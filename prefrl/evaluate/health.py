@@ -8,6 +8,8 @@ PATIENCE = 3
 """Rounds that a critic is given."""
 FORESEEN = 0.05
 """The share of the returns' variance below which it explains nothing."""
+UNFAIR = 0.2
+"""How much more than half a judge may give to what it is shown first, or last."""
 
 
 def warnings(round: int, metrics: Mapping[str, float]) -> dict[str, str]:
@@ -26,5 +28,12 @@ def warnings(round: int, metrics: Mapping[str, float]) -> dict[str, str]:
         found["reward"] = (
             "all responses to a prompt had one reward, for every prompt of the round: nothing was learned from it; "
             "look at the reward (is it constant?), or raise learner.responses"
+        )
+    if abs(bias := metrics.get("label/position_bias", 0.0)) > UNFAIR:
+        first = "first" if bias > 0 else "last"
+        found["judge"] = (
+            f"the judge prefers what it is shown {first}: asked in both orders, the one shown first gets "
+            f"{0.5 + bias:.0%} on average, where half would be fair; its answers are means over both orders, and know "
+            "little: try another judge, or other words"
         )
     return found

@@ -65,6 +65,7 @@ def chapters(record: Record, facts: Facts) -> tuple[Chapter, ...]:
         Chapter("Did it help?", (*_learning(record, facts), *_drift(record, facts))),
         Chapter("Does it follow the expert?", _shifting(record)),
         Chapter("How far from the best?", _exactly(record)),
+        Chapter("Was the judge fair?", _judging(record)),
         Chapter("Was the reward model right?", () if facts.fixed else _fitting(record)),
         Chapter("Is its world like the real one?", _dreaming(record)),
         Chapter("How did it learn?", _training(record)),
@@ -394,6 +395,34 @@ def _compounding(total: float, eps: float, steps: int) -> str:
         "With an error of eps at every step they are eps H; where one mistake spoils all that comes after it they are "
         f"about eps H²/2. After {show_count(steps, 'step')} the newest policy has {show_number(total)}, which is "
         f"{linear} times eps H and {square} times eps H²/2."
+    )
+
+
+def _judging(record: Record) -> tuple[Card, ...]:
+    """Of a judge that is asked in both orders."""
+    shares = {"flipped": record.series("label/flipped"), "refused": record.series("label/refused")}
+    bias = record.series("label/position_bias")
+    if not _known(shares["refused"]):
+        return ()
+    newest = next((value for value in reversed(bias) if value is not None), None)
+    told = "" if newest is None else f" In the newest round that is {show_number(newest)}."
+    curves = [
+        Line(shares["flipped"], "muted", "changed with the order"),
+        Line(shares["refused"], "gold", "refused", ":"),
+    ]
+    return (
+        Card(
+            "Position bias",
+            plots.lines("bias", record.numbers, [Line(bias, "muted")], zero=True),
+            "The mean probability that the judge gives to what it is shown first, less a half: 0 is fair, and 0.5 is "
+            f"one that always says the first.{told} Its answers are means over both orders.",
+        ),
+        Card(
+            "Without a verdict",
+            plots.lines("verdicts", record.numbers, curves, zero=True),
+            "The shares of pairs whose winner changes with the order, and of those that the judge refused, which are "
+            "skipped.",
+        ),
     )
 
 

@@ -422,6 +422,14 @@ def test_wild_numbers_never_crash_it(tmp_path: Path, value: float) -> None:
     check_harmless(page(run_folder(tmp_path / "run", lines, held_out=held_out)))
 
 
+def test_a_judge_that_follows_the_order_is_shown(tmp_path: Path) -> None:
+    said = {"label/pairs": 8.0, "label/refused": 0.25, "label/position_bias": 0.5, "label/flipped": 1.0}
+    found = page(run_folder(tmp_path / "judge", [line(0), line(1, **said), line(2, **said)]))
+    assert "Was the judge fair?" in found.text
+    assert "In the newest round that is 0.50." in found.text
+    assert "Was the judge fair?" not in page(run_folder(tmp_path / "oracle", [line(0), line(1)])).text
+
+
 def test_only_png_files_of_the_examples_folder_are_shown(tmp_path: Path) -> None:
     names = ["../secret.png", "/etc/passwd", "text.png", "link.png", "gone.png", "", ".", "a\0.png", "x" * 5000]
     folder = run_folder(tmp_path / "run", [line(0)], before=[{"strip": name} for name in names])
