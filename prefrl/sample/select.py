@@ -61,7 +61,7 @@ class Uniform(Generic[C]):
 
 def _best(pool: Sequence[C], reward: RewardModel[C], drawn: Integers) -> Integers:
     """(Q, 1) indices of the candidate with the highest score in each of (Q, K)."""
-    scores = reward.score([pool[i] for i in drawn.flat]).reshape(drawn.shape)
+    scores = reward.score([pool[i] for i in drawn.ravel().tolist()]).reshape(drawn.shape)
     return np.take_along_axis(drawn, scores.argmax(1)[:, None], 1)
 
 

@@ -17,7 +17,7 @@ from prefrl.improve.groups import advantages_of
 from prefrl.improve.text import TextLearner, TextLearnerSettings, text_formula
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, Store
-from prefrl.types import Floats, Response, State
+from prefrl.types import Floats, Response, State, Steps
 
 NO_STORE = cast("Store[Response]", None)
 SMALL: dict[str, Any] = {"updates": 2, "prompts": 4, "responses": 4, "evaluation_prompts": 16, "policy": {"chunk": 7}}
@@ -205,7 +205,7 @@ def test_samples_come_in_groups_with_tokens_and_gold(toy_reviews: Reviews) -> No
 def test_every_generated_token_is_counted_once_by_purpose(toy_reviews: Reviews) -> None:
     one, likes = learner(toy_reviews), Rewarded()
     found = one.sample(8, np.random.default_rng(0))
-    assert one.steps == (0, sum(len(r.tokens) for r in found), 0)
+    assert one.steps == Steps(query=sum(len(r.tokens) for r in found))
     one.improve(cast("RewardModel[Response]", _counting := _Counting()), NO_STORE, np.random.default_rng(0))
     assert one.steps.learn == _counting.tokens
     one.evaluate(cast("RewardModel[Response]", likes), np.random.default_rng(0))
