@@ -17,6 +17,9 @@ import numpy as np
 
 from prefrl.types import Floats, Integers
 
+_HEADER = re.compile(r"UC(LA|SC)\b", re.IGNORECASE)
+"""How a file of this form begins, after the university that wrote it."""
+
 PERCENT = 100.0
 BOARD = -1
 """In the place of a macro: a pin that stays where it is."""
@@ -133,7 +136,7 @@ def _lines(path: Path) -> Iterator[_Line]:
         raise ValueError(f"{path}: expected a text file, got bytes that are no UTF-8 ({error.reason})") from error
     for number, line in enumerate(text.splitlines(), 1):
         said = line.split("#")[0].strip()
-        if said and not said.upper().startswith("UCSC"):
+        if said and not _HEADER.match(said):
             yield _Line(path, number, said)
 
 
@@ -144,7 +147,8 @@ def _blocks(path: Path) -> tuple[dict[str, tuple[float, float]], list[str]]:
     sizes: dict[str, tuple[float, float]] = {}
     terminals: list[str] = []
     for line in _lines(path):
-        name, _, rest = line.text.partition(" ")
+        name, *more = line.text.split(None, 1)
+        rest = " ".join(more)
         if _is_count(line.text):
             continue
         if name in sizes or name in terminals:

@@ -245,6 +245,10 @@ class GymnasiumTask:
         return "control"
 
     @property
+    def steps_per_second(self) -> float:
+        return self.fps
+
+    @property
     def action_names(self) -> Sequence[str]:
         known = ACTION_NAMES.get(self.name, ())
         return known if len(known) == self.action_size else ()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.bookshelf import BOARD, Netlist, Pin, read
@@ -28,6 +28,8 @@ TRIED = 64
 """Random plans that say what is usual, and whether all macros find a place."""
 TIGHT = 0.1
 """A chip is too small where in more of these plans a macro finds none."""
+MACROS = 8
+"""Of the generated netlist, unless more are asked for."""
 CLIP_SECONDS = 4.0
 """How long it takes to show a plan being made, about."""
 Positive = Annotated[float, Field(gt=0)]
@@ -40,7 +42,7 @@ class FloorplanSettings(Settings):
     netlist: Path | None = None
     """A Bookshelf file NAME.blocks or NAME.hardblocks, with NAME.nets and perhaps NAME.pl beside it, from the working
     directory where it is relative; a generated netlist when left out."""
-    macros: int = Field(8, ge=4, le=200)
+    macros: int = Field(MACROS, ge=4, le=200)
     """Of the generated netlist, how many there are."""
     chip: tuple[Positive, Positive] | None = None
     """Width and height, in the unit of the netlist; what its terminals lie around when left out, or a square of which
@@ -53,6 +55,12 @@ class FloorplanSettings(Settings):
     """Of the congestion in the gold."""
     frame_size: int = Field(320, ge=16, le=2048)
     """Height and width of drawn frames, in pixels."""
+
+    @model_validator(mode="after")
+    def _one_netlist(self) -> FloorplanSettings:
+        if self.netlist is not None and "macros" in self.model_fields_set and self.macros != MACROS:
+            raise ValueError("macros is of the generated netlist, and netlist names another: leave one of them out")
+        return self
 
     def build(self) -> FloorplanTask:
         """Raises `ConfigError` for files that cannot be read, a macro larger than the chip, and where macros find no
@@ -159,8 +167,7 @@ def generated(macros: int) -> Netlist:
         if rng.random() < 0.4:
             turn = 2 * math.pi * (first + rng.uniform()) / macros
             pins.append(Pin(BOARD, *_on_edge(turn, side)))
-        if len(pins) > 1:
-            nets.append(tuple(pins))
+        nets.append(tuple(pins))
     return Netlist(f"of {macros} macros", tuple(f"m{i}" for i in range(macros)), sizes, tuple(nets))
 
 

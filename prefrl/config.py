@@ -34,6 +34,7 @@ from prefrl.protocols import (
     Threaded,
 )
 from prefrl.report.trackers import Places
+from prefrl.sample.select import UnscoredSettings
 from prefrl.seeding import device_of, streams
 from prefrl.types import Json
 
@@ -158,6 +159,11 @@ class Config(Settings):
             if isinstance(learner, NeedsShowing):
                 learner.check_shown(shows)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
+        if isinstance(select, UnscoredSettings) and select.best_of > self.loop.pool:
+            raise ConfigError(
+                f"select.best_of={select.best_of} chooses among so many candidates for each query, and loop.pool "
+                f"samples {self.loop.pool:g}: set loop.pool={select.best_of}"
+            )
         if isinstance(learner, Particular):
             learner.check_reward(reward)
         if self.loop.labels and reward.fitted and not trainable(reward):

@@ -59,7 +59,6 @@ class Noted(Protocol):
         """Whole sentences, such as how many prompts were left out."""
 
 
-@runtime_checkable
 class DrawnTask(Task, Protocol[C_contra]):
     """A task whose candidates are shown as clips."""
 
@@ -69,6 +68,14 @@ class DrawnTask(Task, Protocol[C_contra]):
 
     def frames(self, candidate: C_contra, /) -> np.ndarray:
         """(T, H, W, 3) uint8 pictures of a candidate."""
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A task that stands for a world in which steps take time, as robots' do and board games' do not."""
+
+    @property
+    def steps_per_second(self) -> float: ...
 
 
 class Transition(NamedTuple):

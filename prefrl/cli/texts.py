@@ -1,4 +1,4 @@
-"""The commands for texts alone: win-rate, generate."""
+"""Commands for runs of text alone: win-rate, generate."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from prefrl.kinds import find
-from prefrl.protocols import DrawnTask, Task
+from prefrl.protocols import Clocked, Task
 from prefrl.types import Json
 
 PURPOSES = ("learn", "query", "evaluate")
@@ -51,9 +50,8 @@ def read_metrics(folder: Path) -> list[Json]:
 
 
 def pace(task: Task) -> float | None:
-    """Steps a second of the world that a task stands for; None where there is none: for texts and pictures."""
-    kind = find(task.kind)
-    return task.fps if isinstance(task, DrawnTask) and kind is not None and kind.stepwise else None
+    """Steps a second of the world that a task stands for; None where there is none outside."""
+    return task.steps_per_second if isinstance(task, Clocked) else None
 
 
 def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: float = 0.0) -> Json:

@@ -32,8 +32,9 @@ class UnscoredSettings(Settings):
     newest: float = Field(1.0, gt=0, le=1)
     """The share of the pool, from its end where the newest are, that may be asked about."""
     best_of: int = Field(1, ge=1)
-    """With one candidate, that of so many from the same start which the newest reward scores highest: people are then
-    shown the better answer, to make it better still. Before the first fit it is any of them."""
+    """With one candidate, that of so many which the newest reward scores highest (to one prompt, for texts): people are
+    then shown the better answer, to make it better still. Before the first fit it is any of them. `loop.pool` has to be
+    as large."""
 
     @model_validator(mode="after")
     def _one_is_the_best(self) -> UnscoredSettings:

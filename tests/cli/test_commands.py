@@ -173,7 +173,7 @@ def test_a_run_without_a_folder_makes_a_new_one_and_says_which(prefrl: Shell) ->
 def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -> None:
     assert prefrl("run control/toy --dry-run") == 0
     assert re.search(r"about ([\d.]+ s|\d+ min)", prefrl.out)
-    assert re.search(r"The world: .* \([\d,]+ steps at 10.0 a second\)\. People: .* 5 s each", prefrl.out)
+    assert re.search(r"People: 10 min 0 s \(120 answers at 5 s each\)\. The machine: ", prefrl.out)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -14,7 +14,7 @@ NumTerminals : 2
 
 big hardrectilinear 4 (0, 0) (0, 30) (20, 30) (20, 0)
 soft softrectangular 100 0.25 0.25
-small hardrectilinear 4 (1, 1) (1, 5) (9, 5) (9, 1)
+small\thardrectilinear 4 (1, 1) (1, 5) (9, 5) (9, 1)
 p1 terminal
 p2 terminal
 """
@@ -40,6 +40,14 @@ def blocks(tmp_path: Path) -> Path:
     path = tmp_path / "chip.blocks"
     path.write_text(BLOCKS)
     return path
+
+
+def test_headers_of_both_universities_are_passed_over(blocks: Path) -> None:
+    plain = read(blocks)
+    for end, university in ((".blocks", "UCLA"), (".nets", "UCLA"), (".pl", "UCSC")):
+        file = blocks.with_suffix(end)
+        file.write_text(f"{university} {end[1:]} 1.0\n{file.read_text()}")
+    assert read(blocks).nets == plain.nets
 
 
 def test_blocks_nets_and_places_are_read(blocks: Path) -> None:

@@ -59,6 +59,6 @@ def test_what_is_known_of_no_world_is_not_made_up(tmp_path: Path) -> None:
     assert outside(tmp_path / "nothing", labels={"asked": 0, "answered": 0, "skipped": 0}) == ""
 
 
-def test_only_what_goes_step_by_step_has_a_pace() -> None:
-    paces = {name: pace(Config.load(name).build_task()) for name in ("control/toy", "text/toy", "pictures/digits")}
-    assert paces == {"control/toy": 10.0, "text/toy": None, "pictures/digits": None}
+def test_only_a_world_outside_has_a_pace() -> None:
+    paces = {name: pace(Config.load(name).build_task()) for name in ("control/pendulum", "control/toy", "text/toy")}
+    assert paces == {"control/pendulum": 20.0, "control/toy": None, "text/toy": None}
