@@ -34,7 +34,6 @@ from prefrl.protocols import (
     Threaded,
 )
 from prefrl.report.trackers import Places
-from prefrl.sample.select import UnscoredSettings
 from prefrl.seeding import device_of, streams
 from prefrl.types import Json
 
@@ -147,6 +146,7 @@ class Config(Settings):
     def build(self, store: Store) -> Loop:
         """Make every component, and the loop that joins them, on an open store."""
         from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
+        from prefrl.sample.select import UnscoredSettings  # and so is scipy
 
         rng, select = streams(self.seed, 0).build, cast(SelectorSettings, self.select)
         task = self.build_task()

@@ -64,11 +64,25 @@ def _group(name: str, annotation: Any, definitions: Json) -> Json:
 def _define(cls: type[Settings], definitions: Json, kind: str | None) -> Json:
     """File a settings class under its name, and refer to it. A component's kind must be spelled out."""
     made = schema_of(cls)
-    definitions |= made.pop("$defs", {})
+    made, inner = _apart(cls.__name__, made, made.pop("$defs", {}), definitions)
+    definitions |= inner
     if kind is not None:
         made["required"] = sorted({"kind", *made.get("required", [])})
     definitions[cls.__name__] = made
     return {"$ref": f"#/$defs/{cls.__name__}"}
+
+
+def _apart(outer: str, made: Json, inner: Json, known: Json) -> tuple[Json, Json]:
+    """A schema and its `$defs`, with another name for those that are components of their own as well.
+
+    As a part of another component they need not spell out their kind, and optimise nothing by themselves.
+    """
+    both = json.dumps([made, inner])
+    clashing = {name: f"{outer}.{name}" for name, group in inner.items() if known.get(name, group) != group}
+    for name, other in clashing.items():
+        both = both.replace(f'"#/$defs/{name}"', f'"#/$defs/{other}"')
+    made, inner = json.loads(both)
+    return made, {clashing.get(name, name): group for name, group in inner.items()}
 
 
 def text() -> str:

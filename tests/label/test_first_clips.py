@@ -31,7 +31,8 @@ def begin(store: Store[Segment], monkeypatch: pytest.MonkeyPatch) -> Iterator[Be
     """`begin(order, ahead_seconds)`: a labeler whose drawer does this with every clip, and a console to read."""
     folder = store.folder
 
-    def draws(folder: Path, settings: ClipSettings) -> Clips:
+    def draws(folder: Path, settings: ClipSettings, still: bool) -> Clips:
+        assert not still
         return Clips(folder, settings, [sys.executable, str(FAKE), str(folder)])
 
     monkeypatch.setattr(site, "Clips", draws)
