@@ -78,6 +78,9 @@ class DynaSettings(Settings):
     def work(self) -> float:
         return self.inside.work()
 
+    def real_work(self) -> float:
+        return float(self.episodes)
+
     def build(self, task: Task, rng: np.random.Generator) -> Dyna:
         return Dyna(self, simulated(task, f"learner kind {self.kind!r} plays real episodes of control"), rng)
 

@@ -102,7 +102,11 @@ class PlannerSettings(Settings):
         return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
 
     def work(self) -> float:
-        return float(self.plan * self.candidates * self.iterations)
+        tried = self.simulations if self.algorithm == "mcts" else self.candidates * self.iterations
+        return float(tried * self.plan)
+
+    def real_work(self) -> float:
+        return float(self.episodes)
 
     def build(self, task: Task, rng: np.random.Generator) -> Planner | TreePlanner:
         """Raises `ConfigError` for actions, or states, that the algorithm is not for."""

@@ -158,6 +158,11 @@ def test_other_tasks_are_refused() -> None:
         DynaSettings().build(Texts(), np.random.default_rng(0))
 
 
+def test_real_steps_grow_by_episodes_and_work_by_what_is_imagined() -> None:
+    settings = DynaSettings.model_validate({"episodes": 3, "inside": {"steps_per_round": 5000}})
+    assert (settings.work(), settings.real_work()) == (5000, 3)
+
+
 def test_a_shrunk_run_can_be_read_again() -> None:
     small = DynaSettings().shrunk()
     assert DynaSettings.model_validate(small.model_dump()) == small

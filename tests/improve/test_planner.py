@@ -14,7 +14,9 @@ from control_stubs import Known, point
 from test_loop import leaves
 
 from prefrl.components import ConfigError
+from prefrl.config import Config
 from prefrl.improve.planner import Planner, PlannerSettings, Search
+from prefrl.stages.trial import estimate
 from prefrl.store import Store
 from prefrl.types import Floats, Segment, Steps
 
@@ -161,6 +163,23 @@ def test_where_the_world_is_not_to_be_trusted_nothing_is_planned_and_it_says_so(
     found = learner.evaluate(Known(), np.random.default_rng(2))
     assert learner.steps.imagined == 0
     assert "has stopped dreaming" in found.notes[0]
+
+
+def test_a_dry_run_scales_real_steps_by_real_episodes_alone() -> None:
+    given = "learner.kind=planner", "learner.evaluation_episodes=1"
+    narrow, wide, longer = (
+        estimate(Config.load("control/toy", [*given, more]))
+        for more in ("learner.candidates=20", "learner.candidates=1000", "learner.episodes=3")
+    )
+    assert narrow.steps == wide.steps
+    assert longer.steps > 2 * narrow.steps
+    assert wide.machine > narrow.machine
+
+
+def test_what_a_search_takes_grows_by_what_it_tries() -> None:
+    tree = PlannerSettings.model_validate({"algorithm": "mcts", "simulations": 50, "plan": 7, "episodes": 3})
+    assert (tree.work(), tree.real_work()) == (350, 3)
+    assert PlannerSettings(plan=5, candidates=10, iterations=2).work() == 100
 
 
 class Unbounded:
