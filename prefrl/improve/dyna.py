@@ -82,6 +82,7 @@ class DynaSettings(Settings):
         return float(self.episodes)
 
     def build(self, task: Task, rng: np.random.Generator) -> Dyna:
+        """Raises `ConfigError` for a task that is not of control, and where not all actions are always legal."""
         return Dyna(self, simulated(task, f"learner kind {self.kind!r} plays real episodes of control"), rng)
 
     def formula(self) -> str:

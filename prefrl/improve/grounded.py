@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from prefrl.components import ConfigError
 from prefrl.envs.learned import Transitions, World, WorldSettings
+from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, whole_episodes
 from prefrl.protocols import ControlTask
 from prefrl.sample.segments import cut, first_rollout, placed, windows
@@ -21,12 +23,27 @@ AWAKE = (
 )
 
 
+def all_legal(task: ControlTask) -> None:
+    """Raises `ConfigError` where not all actions are always legal."""
+    if task.action_bounds is not None:
+        return
+    envs = environments(task, 1)
+    envs.reset(np.random.default_rng(0))
+    if envs.legal() is not None:
+        raise ConfigError(
+            f"a learned world does not know which actions are legal, and in {task.name} not all of them always are: "
+            "use learner.kind=control"
+        )
+
+
 class Grounded:
     """A world, and the real steps that it is learned from. `spent` counts them."""
 
     def __init__(
         self, settings: WorldSettings, task: ControlTask, device: torch.device, rng: np.random.Generator
     ) -> None:
+        """Raises `ConfigError` where not all actions are always legal."""
+        all_legal(task)
         self._task = task
         self.world = World(settings, (task.observation_size, task.action_size), device, rng)
         self.data: Transitions | None = None
@@ -91,4 +108,4 @@ class Grounded:
         self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
 
 
-__all__ = ["Grounded"]
+__all__ = ["Grounded", "all_legal"]

@@ -109,7 +109,8 @@ class PlannerSettings(Settings):
         return float(self.episodes)
 
     def build(self, task: Task, rng: np.random.Generator) -> Planner | TreePlanner:
-        """Raises `ConfigError` for actions, or states, that the algorithm is not for."""
+        """Raises `ConfigError` for actions, or states, that the algorithm is not for, and where not all actions are
+        always legal."""
         found = simulated(task, f"learner kind {self.kind!r} plays real episodes of control")
         if self.algorithm != "mcts":
             return Planner(self, found, rng)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from control_stubs import Known, point
+from corridor import corridor
 from test_loop import leaves
 
 from prefrl.components import ConfigError
@@ -156,11 +157,13 @@ class Texts:
 def test_other_tasks_are_refused() -> None:
     with pytest.raises(ConfigError, match="'dyna' plays real episodes of control"):
         DynaSettings().build(Texts(), np.random.default_rng(0))
+    with pytest.raises(ConfigError, match=r"in Corridor not all of them always are: use learner\.kind=control"):
+        dyna(corridor())
 
 
 def test_real_steps_grow_by_episodes_and_work_by_what_is_imagined() -> None:
-    settings = DynaSettings.model_validate({"episodes": 3, "inside": {"steps_per_round": 5000}})
-    assert (settings.work(), settings.real_work()) == (5000, 3)
+    settings = DynaSettings.model_validate({"episodes": 3, "inside": {"steps_per_round": 6400}})
+    assert (settings.work(), settings.real_work()) == (6400, 3)
 
 
 def test_a_shrunk_run_can_be_read_again() -> None:

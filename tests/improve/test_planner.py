@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from test_loop import leaves
 
 from prefrl.components import ConfigError
@@ -194,3 +195,5 @@ def test_actions_that_cannot_be_drawn_are_refused() -> None:
         planner(point(discrete=True))
     with pytest.raises(ConfigError, match="those of Free have none"):
         planner(Unbounded())
+    with pytest.raises(ConfigError, match=r"in Corridor not all of them always are: use learner\.kind=control"):
+        planner(corridor())
