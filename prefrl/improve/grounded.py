@@ -16,10 +16,15 @@ from prefrl.types import Metrics, Segment, State
 PLAYS = 4
 """So many rounds' real episodes are kept to be asked about."""
 AWAKE = (
-    "the learned world is not to be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
+    "the learned world cannot be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
     "observation, {held_out:.0%} of the variance of the changes) leaves no step to imagine; the run has stopped "
     "dreaming, and its policy stays as it is until the world is better: raise learner.episodes, so that it sees more, "
     "or learner.world.tolerance"
+)
+UNTESTED = (
+    "the learned world cannot be trusted: no held-out step says how good it is, since too little has moved in the real "
+    "episodes so far, or since its fit has diverged; the run has stopped dreaming, and its policy stays as it is until "
+    "there is one: raise learner.episodes, so that the world sees more, or lower learner.world.learning_rate"
 )
 
 
@@ -83,11 +88,11 @@ class Grounded:
         return placed(self._task, found)
 
     def learn(self, rng: np.random.Generator) -> Metrics:
-        """Fit the world on all real steps; the metrics are `World.fit`'s. A note says where it is not to be trusted."""
+        """Fit the world on all real steps; the metrics are `World.fit`'s. A note says where it cannot be trusted."""
         assert self.data is not None
-        metrics = self.world.fit(self.data, rng)
-        note = AWAKE.format(error=self.world.error, held_out=self.world.held_out)
-        self.fresh, self.notes = False, () if self.world.reach else (note,)
+        metrics, world = self.world.fit(self.data, rng), self.world
+        note = AWAKE.format(error=world.error, held_out=world.held_out) if world.fitted else UNTESTED
+        self.fresh, self.notes = False, () if world.reach else (note,)
         return metrics
 
     def state(self) -> State:
@@ -102,7 +107,7 @@ class Grounded:
         self.world.load(state["world"])
 
     def _keep(self, rollout: Rollout, rng: np.random.Generator) -> None:
-        new = Transitions.of(rollout, self.world.settings.held_out, rng)
+        new = Transitions.of(rollout, self.world.settings.held_out, rng, self.data)
         self.data = new if self.data is None else self.data.joined(new)
         self.fresh, self.spent = True, self.spent + rollout.ends.size
         self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1

@@ -163,7 +163,16 @@ def test_where_the_world_is_not_to_be_trusted_nothing_is_planned_and_it_says_so(
     assert learner.improve(Known(), store, rng)["reach"] == 0
     found = learner.evaluate(Known(), np.random.default_rng(2))
     assert learner.steps.imagined == 0
+    assert "cannot be trusted" in found.notes[0]
     assert "has stopped dreaming" in found.notes[0]
+
+
+def test_a_world_that_cannot_be_tested_is_not_trusted_and_the_note_has_numbers_or_none() -> None:
+    ground = planner().ground
+    ground.play(1, lambda observations, *_: (np.zeros_like(observations),) * 2, np.random.default_rng(0))
+    assert ground.learn(np.random.default_rng(1)) == {"world_steps": 0.0, "reach": 0.0}
+    assert "no held-out step says how good it is" in ground.notes[0]
+    assert "nan" not in ground.notes[0]
 
 
 def test_a_dry_run_scales_real_steps_by_real_episodes_alone() -> None:
