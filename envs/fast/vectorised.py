@@ -59,6 +59,6 @@ def _check(actions: Floats, legal: Bools) -> None:
         there = np.flatnonzero(legal[at]).tolist()
         some = ", ".join(map(str, there[:SHOWN])) + (", ..." if len(there) > SHOWN else "")
         raise ValueError(
-            f"action {chosen[at]} of environment {at} is not legal there; expected one of [{some}]: use a learner that keeps to legal actions, such as "
-            "learner.kind=control"
+            f"action {chosen[at]} of environment {at} is not legal there; expected one of [{some}]: use a "
+            "learner that keeps to legal actions, such as learner.kind=control"
         )
