@@ -97,12 +97,13 @@ class Grounded:
 
     def state(self) -> State:
         data = None if self.data is None else self.data.state()
-        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played}
+        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played, "notes": list(self.notes)}
         return counted | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
 
     def load(self, state: State) -> None:
         self.data = None if state["data"] is None else Transitions(**state["data"])
         self.fresh, self.spent, self._played = state["fresh"], state["spent"], state["played"]
+        self.notes = tuple(state["notes"])
         self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
 

@@ -140,6 +140,7 @@ def test_questions_after_the_first_are_about_the_policy_as_it_is(store: Store[Se
     [
         ({"inside": {"device": "cpu"}}, r"inside\.device: write it as learner\.device"),
         ({"inside": {"evaluation_episodes": 3}}, r"write it as learner\.evaluation_episodes"),
+        ({"inside": {"rollback": 0.3}}, r"inside\.rollback: the learner inside keeps no best policy"),
         ({"inside": {"clone": {"keep": 0.1}}}, r"give its run as learner\.inside\.start"),
     ],
 )
