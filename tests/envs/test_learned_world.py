@@ -140,7 +140,7 @@ def falling(moves: int, steps: int = 100, seed: int = 0) -> Rollout:
     actions, ends = rng.normal(size=(1, steps, 2)).astype(np.float32), np.zeros((1, steps), bool)
     if moves == 0:
         places[:], actions[:] = 0.0, 0.0
-    seen = {"observations": places[:, :-1], "final_observations": places[:, 1:], "actions": actions}
+    seen: dict[str, Any] = {"observations": places[:, :-1], "final_observations": places[:, 1:], "actions": actions}
     return replace(found, **seen, choices=actions, terminated=ends, truncated=ends, gold=np.zeros((1, steps)))
 
 
