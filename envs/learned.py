@@ -86,10 +86,14 @@ class Transitions:
         return len(self.observations)
 
     @classmethod
-    def of(cls, rollout: Rollout, share: float, rng: np.random.Generator) -> Transitions:
+    def of(
+        cls, rollout: Rollout, share: float, rng: np.random.Generator, before: Transitions | None = None
+    ) -> Transitions:
         """The steps of a rollout, a share of them held out for good, in blocks: a step whose neighbours were learned
-        from is no test. Of what lies still, each action is kept once in each place: else the rest that follows an early
-        end would be most of what is learned.
+        from is no test. The share is of the steps that move, as near as blocks come to it, with what the plays `before`
+        held out too much or too little; the first play that can holds out a block, and none holds out all of them. Of
+        what lies still, each action is kept once in each place: else the rest that follows an early end would be most
+        of what is learned.
 
         Raises `ConfigError` where not all actions are always legal: a learned world does not know which are.
         """
@@ -103,14 +107,25 @@ class Transitions:
         still = np.flatnonzero((seen == following).all(1))
         _, first = np.unique(np.concatenate([seen, done], 1)[still], axis=0, return_index=True)
         kept = np.setdiff1d(np.arange(len(seen)), np.delete(still, first))
-        moves = seen[kept], done[kept].astype(np.float32), following[kept]
-        return cls(*moves, rollout.terminated.ravel()[kept], _blocks(rollout, share, rng)[kept])
+        moving = (seen != following).any(1)
+        if not moving.any():
+            moving[kept] = True
+        earlier = np.zeros(0, bool) if before is None else before.held_out[before.moves]
+        due = share * (len(earlier) + moving.sum()) - earlier.sum()
+        held_out = _blocks(moving.reshape(rollout.ends.shape), share, due, 0 if earlier.any() else 1, rng)
+        steps = seen[kept], done[kept].astype(np.float32), following[kept]
+        return cls(*steps, rollout.terminated.ravel()[kept], held_out[kept])
+
+    @property
+    def moves(self) -> Bools:
+        """(N,): whether a step changed what is seen."""
+        found: Bools = (self.observations != self.following).any(1)
+        return found
 
     @property
     def starts(self) -> Floats:
         """(M, O): where something moves on from; all, where nothing does."""
-        moves = (self.observations != self.following).any(1)
-        return self.observations[moves] if moves.any() else self.observations
+        return self.observations[self.moves] if self.moves.any() else self.observations
 
     def joined(self, other: Transitions) -> Transitions:
         return Transitions(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
@@ -203,8 +218,11 @@ class World:
 
         Metrics: world_loss, world_held_out (mean squared errors of members, in variances of the changes: 1 is no better
         than their mean), world_error (root mean square, in standard deviations of an observation), world_steps (real
-        steps learned from) and reach (steps).
+        steps learned from) and reach (steps). Where nothing is held out yet, nothing is learned, since nobody could say
+        how far to trust it: the last two alone, 0 both.
         """
+        if not data.held_out.any():
+            return {"world_steps": 0.0, "reach": 0.0}
         self._rebase(data)
         settings = self.settings
         train, held = (self._normalised(data, at) for at in (~data.held_out, data.held_out))
@@ -321,15 +339,19 @@ class World:
         return found | {name: torch.from_numpy(x).to(inputs.device) for name, x in sides.items()}
 
 
-def _blocks(rollout: Rollout, share: float, rng: np.random.Generator) -> Bools:
-    """(n T,): the steps of some blocks, drawn among all that there are in which something moves."""
-    rows, steps = rollout.ends.shape
-    length = min(BLOCK, max(1, int(share * rows * steps)))  # a short play is not to be held out whole
+def _blocks(moving: Bools, share: float, due: float, least: int, rng: np.random.Generator) -> Bools:
+    """(n, T) which steps move -> (n T,): the steps of some blocks, drawn among those in which one does.
+
+    As many as come nearest to `due` steps that move; but `least` at least where there are more, and never all.
+    """
+    rows, steps = moving.shape
+    length = min(BLOCK, max(1, int(share * moving.sum())))  # a short play is not to be held out whole
     block = np.arange(rows)[:, None] * steps + np.arange(steps) // length
-    moves = (rollout.observations != rollout.final_observations).any(2)
-    blocks = np.unique(block[moves] if moves.any() else block)
-    chosen = rng.permutation(blocks)[: max(1, round(share * len(blocks)))]
-    found: Bools = np.isin(block, chosen).ravel()
+    blocks, sizes = np.unique(block[moving], return_counts=True)
+    order = rng.permutation(len(blocks))
+    nearest = int((sizes[order].cumsum() - sizes[order] / 2 <= due).sum())
+    chosen = order[: min(max(nearest, least), len(blocks) - 1)]
+    found: Bools = np.isin(block, blocks[chosen]).ravel()
     return found
 
 

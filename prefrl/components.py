@@ -67,6 +67,10 @@ class Settings(BaseModel):
         """How much a round takes, in any unit: a dry run compares it with that of the shrunk settings."""
         return 1.0
 
+    def real_work(self) -> float:
+        """The same of a round's real steps alone, for learners that also imagine some."""
+        return self.work()
+
 
 TABLE: dict[Role, dict[str, str]] = {
     "tasks": {

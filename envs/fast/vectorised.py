@@ -7,6 +7,9 @@ import numpy as np
 from prefrl.protocols import Dynamics, Transition
 from prefrl.types import Bools, Floats
 
+SHOWN = 10
+"""So many of the legal actions stand in a message."""
+
 
 class Vectorised:
     """n environments of one `Dynamics`; implements `prefrl.protocols.Environments`."""
@@ -53,8 +56,9 @@ def _check(actions: Floats, legal: Bools) -> None:
     wrong = np.flatnonzero(~legal[np.arange(len(chosen)), chosen])
     if len(wrong):
         at = int(wrong[0])
+        there = np.flatnonzero(legal[at]).tolist()
+        some = ", ".join(map(str, there[:SHOWN])) + (", ..." if len(there) > SHOWN else "")
         raise ValueError(
-            f"action {chosen[at]} of environment {at} is not legal there; expected one of "
-            f"{np.flatnonzero(legal[at]).tolist()}: use a learner that keeps to legal actions, such as "
-            "learner.kind=control"
+            f"action {chosen[at]} of environment {at} is not legal there; expected one of [{some}]: use a "
+            "learner that keeps to legal actions, such as learner.kind=control"
         )

@@ -61,6 +61,11 @@ class DynaSettings(Settings):
         for name in OUTSIDE:
             if getattr(self.inside, name) != getattr(usual, name):
                 raise ValueError(f"inside.{name}: write it as learner.{name}; the learner inside plays nothing real")
+        if self.inside.rollback not in (usual.rollback, None):
+            raise ValueError(
+                "inside.rollback: the learner inside keeps no best policy, since its evaluations would be of the real "
+                "world; leave it out"
+            )
         if self.inside.clone.on:
             raise ValueError(
                 "inside.clone: demonstrations are cloned by learner.kind=control; give its run as learner.inside.start"
@@ -78,7 +83,11 @@ class DynaSettings(Settings):
     def work(self) -> float:
         return self.inside.work()
 
+    def real_work(self) -> float:
+        return float(self.episodes)
+
     def build(self, task: Task, rng: np.random.Generator) -> Dyna:
+        """Raises `ConfigError` for a task that is not of control, and where not all actions are always legal."""
         return Dyna(self, simulated(task, f"learner kind {self.kind!r} plays real episodes of control"), rng)
 
     def formula(self) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from prefrl.components import ConfigError
 from prefrl.envs.learned import Transitions, World, WorldSettings
+from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, whole_episodes
 from prefrl.protocols import ControlTask
 from prefrl.sample.segments import cut, first_rollout, placed, windows
@@ -14,11 +16,29 @@ from prefrl.types import Metrics, Segment, State
 PLAYS = 4
 """So many rounds' real episodes are kept to be asked about."""
 AWAKE = (
-    "the learned world is not to be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
+    "the learned world cannot be trusted: its error in a held-out step ({error:.3g} standard deviations of an "
     "observation, {held_out:.0%} of the variance of the changes) leaves no step to imagine; the run has stopped "
     "dreaming, and its policy stays as it is until the world is better: raise learner.episodes, so that it sees more, "
     "or learner.world.tolerance"
 )
+UNTESTED = (
+    "the learned world cannot be trusted: no held-out step says how good it is, since too little has moved in the real "
+    "episodes so far, or since its fit has diverged; the run has stopped dreaming, and its policy stays as it is until "
+    "there is one: raise learner.episodes, so that the world sees more, or lower learner.world.learning_rate"
+)
+
+
+def all_legal(task: ControlTask) -> None:
+    """Raises `ConfigError` where not all actions are always legal."""
+    if task.action_bounds is not None:
+        return
+    envs = environments(task, 1)
+    envs.reset(np.random.default_rng(0))
+    if envs.legal() is not None:
+        raise ConfigError(
+            f"a learned world does not know which actions are legal, and in {task.name} not all of them always are: "
+            "use learner.kind=control"
+        )
 
 
 class Grounded:
@@ -27,6 +47,8 @@ class Grounded:
     def __init__(
         self, settings: WorldSettings, task: ControlTask, device: torch.device, rng: np.random.Generator
     ) -> None:
+        """Raises `ConfigError` where not all actions are always legal."""
+        all_legal(task)
         self._task = task
         self.world = World(settings, (task.observation_size, task.action_size), device, rng)
         self.data: Transitions | None = None
@@ -66,29 +88,30 @@ class Grounded:
         return placed(self._task, found)
 
     def learn(self, rng: np.random.Generator) -> Metrics:
-        """Fit the world on all real steps; the metrics are `World.fit`'s. A note says where it is not to be trusted."""
+        """Fit the world on all real steps; the metrics are `World.fit`'s. A note says where it cannot be trusted."""
         assert self.data is not None
-        metrics = self.world.fit(self.data, rng)
-        note = AWAKE.format(error=self.world.error, held_out=self.world.held_out)
-        self.fresh, self.notes = False, () if self.world.reach else (note,)
+        metrics, world = self.world.fit(self.data, rng), self.world
+        note = AWAKE.format(error=world.error, held_out=world.held_out) if world.fitted else UNTESTED
+        self.fresh, self.notes = False, () if world.reach else (note,)
         return metrics
 
     def state(self) -> State:
         data = None if self.data is None else self.data.state()
-        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played}
+        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played, "notes": list(self.notes)}
         return counted | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
 
     def load(self, state: State) -> None:
         self.data = None if state["data"] is None else Transitions(**state["data"])
         self.fresh, self.spent, self._played = state["fresh"], state["spent"], state["played"]
+        self.notes = tuple(state["notes"])
         self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
 
     def _keep(self, rollout: Rollout, rng: np.random.Generator) -> None:
-        new = Transitions.of(rollout, self.world.settings.held_out, rng)
+        new = Transitions.of(rollout, self.world.settings.held_out, rng, self.data)
         self.data = new if self.data is None else self.data.joined(new)
         self.fresh, self.spent = True, self.spent + rollout.ends.size
         self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
 
 
-__all__ = ["Grounded"]
+__all__ = ["Grounded", "all_legal"]

@@ -38,6 +38,13 @@ ALGORITHMS: dict[str, dict[str, object]] = {
     "mcts": {"plan": 80, "discount": 0.95, "episodes": 16},
 }
 """Where their defaults are others than those of the fields below."""
+DRAWS = ("world", "candidates", "iterations", "std")
+OWN: dict[str, tuple[str, ...]] = {
+    "cem": (*DRAWS, "elites"),
+    "mppi": (*DRAWS, "temperature"),
+    "mcts": ("simulations", "exploration", "epsilon"),
+}
+"""The settings that not all of them have."""
 NARROWEST = 0.05
 """The least standard deviation that cem draws with, as a share of `std`."""
 
@@ -87,25 +94,37 @@ class PlannerSettings(Settings):
     def _fill_in(cls, given: object) -> object:
         return filled_in(given, ALGORITHMS)
 
+    @model_validator(mode="after")
+    def _none_of_others(self) -> PlannerSettings:
+        """What another algorithm's settings say would be ignored. Defaults may stand, as a saved run has them all."""
+        others = {name for names in OWN.values() for name in names} - {*OWN[self.algorithm]}
+        for name in sorted(others & self.model_fields_set):
+            if getattr(self, name) != type(self).model_fields[name].default:
+                whose = " and ".join(one for one, names in OWN.items() if name in names)
+                raise ValueError(
+                    f"{name} is a setting of {whose}, and algorithm={self.algorithm} has none: leave it out"
+                )
+        return self
+
     def shrunk(self) -> PlannerSettings:
-        least = {
-            "candidates": 10,
-            "iterations": 1,
-            "simulations": 2,
-            "plan": min(self.plan, 3),
-            "evaluation_episodes": 1,
-            "episodes": 1,
-        }
-        return self.model_copy(update={**least, "world": self.world.shrunk()})
+        least = {"plan": min(self.plan, 3), "evaluation_episodes": 1, "episodes": 1}
+        if self.algorithm == "mcts":
+            return self.model_copy(update={**least, "simulations": 2})
+        return self.model_copy(update={**least, "candidates": 10, "iterations": 1, "world": self.world.shrunk()})
 
     def with_evaluation_of(self, other: PlannerSettings) -> PlannerSettings:
         return self.model_copy(update={"evaluation_episodes": other.evaluation_episodes})
 
     def work(self) -> float:
-        return float(self.plan * self.candidates * self.iterations)
+        tried = self.simulations if self.algorithm == "mcts" else self.candidates * self.iterations
+        return float(tried * self.plan)
+
+    def real_work(self) -> float:
+        return float(self.episodes)
 
     def build(self, task: Task, rng: np.random.Generator) -> Planner | TreePlanner:
-        """Raises `ConfigError` for actions, or states, that the algorithm is not for."""
+        """Raises `ConfigError` for actions, or states, that the algorithm is not for, and where not all actions are
+        always legal."""
         found = simulated(task, f"learner kind {self.kind!r} plays real episodes of control")
         if self.algorithm != "mcts":
             return Planner(self, found, rng)

@@ -17,6 +17,7 @@ import numpy as np
 from prefrl.components import ConfigError
 from prefrl.envs.counted import Counted
 from prefrl.envs.exact import MDP
+from prefrl.improve.grounded import all_legal
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.divided import environments
@@ -24,6 +25,9 @@ from prefrl.policies.rollout import Rollout, step_rewards, whole_episodes
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store
 from prefrl.sample.segments import first_rollout
 from prefrl.types import Evaluation, Floats, Integers, Metrics, Segment, State, Steps
+
+SHOWN = 10
+"""So many numbers of an observation stand in a message."""
 
 
 @dataclass(frozen=True)
@@ -79,18 +83,38 @@ def _ucb(values: Floats, tried: Floats, weight: float, rng: np.random.Generator)
     return found
 
 
+def _countable(task: ControlTask) -> None:
+    """Raises `ConfigError` for a task whose states and actions cannot be counted; takes one step to find out."""
+    if task.action_bounds is not None:
+        raise ConfigError(
+            f"learner.algorithm=mcts counts discrete actions, and those of {task.name} are continuous: use "
+            "learner.algorithm=cem"
+        )
+    envs = environments(task, 1)
+    first = envs.reset(np.random.default_rng(0))
+    after = envs.step(np.eye(1, task.action_size, dtype=np.float32))
+    for seen in (first, after.final_observations, after.observations):
+        if not (((seen == 0) | (seen == 1)).all() and (seen.sum(1) == 1).all()):
+            raise ConfigError(
+                f"learner.algorithm=mcts counts states, which have to be seen one-hot, as task.kind=gridworld shows "
+                f"them; {task.name} shows {_start_of(seen[0])}: use learner.kind=dyna"
+            )
+
+
+def _start_of(numbers: Floats) -> str:
+    """At most ten of them."""
+    return f"[{', '.join(f'{x:.4g}' for x in numbers[:SHOWN])}{', ...' if len(numbers) > SHOWN else ''}]"
+
+
 class TreePlanner:
     """A `prefrl.protocols.Learner` of segments: it counts transitions, and plans in them for all states in a round."""
 
     def __init__(self, settings: TreeSearch, task: ControlTask) -> None:
-        """Raises `ConfigError` for states that are not seen one-hot."""
+        """Raises `ConfigError` for actions that are continuous or not always legal, and for states that are not seen
+        one-hot."""
         self._settings, self._task = settings, task
-        first = environments(task, 1).reset(np.random.default_rng(0))
-        if not (((first == 0) | (first == 1)).all() and (first.sum(1) == 1).all()):
-            raise ConfigError(
-                f"learner.algorithm=mcts counts states, which have to be seen one-hot, as task.kind=gridworld shows "
-                f"them; {task.name} shows {first[0]}: use learner.kind=dyna"
-            )
+        all_legal(task)
+        _countable(task)
         self.world = Counted(task.observation_size, task.action_size)
         self.values: Floats = np.zeros((task.observation_size, task.action_size))
         """What each action was found to be worth, by the newest reward."""

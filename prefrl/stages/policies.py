@@ -105,7 +105,15 @@ def _of_env(env: str) -> Json:
 
 
 def _acting(folder: Path, best: bool) -> tuple[Acts, Any, int]:
+    from prefrl.improve.planner import Planner
+    from prefrl.improve.tree import TreePlanner
+
     learner, task, round = _learner_of(folder, best)
+    if isinstance(learner, Planner | TreePlanner):
+        raise RunError(
+            f"{folder}: learner.kind=planner has no policy to load: what to do is searched for in each step, in the "
+            "run's learned world; `prefrl evaluate` plays its episodes"
+        )
     if not isinstance(learner, Acts):
         raise RunError(f"{folder}: its policy does not act in an environment; expected a run of a control task")
     return learner, task, round

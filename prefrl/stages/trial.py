@@ -38,7 +38,8 @@ def estimate(config: Config) -> Spent:
     }
     evaluations = config.loop.rounds + 1
     seconds = sum(one.get(f"seconds/{stage}", 0.0) * factor for stage, factor in growth.items())
-    steps = {"learn": growth["improve"], "query": growth["sample"], "evaluate": evaluations / 2}  # of the two in `one`
+    learned = config.loop.rounds * config.learner.real_work() / small.learner.real_work()
+    steps = {"learn": learned, "query": growth["sample"], "evaluate": evaluations / 2}  # of the two in `one`
     spent = sum(one.get(f"steps/{purpose}", 0.0) * factor for purpose, factor in steps.items())
     return Spent(
         round(spent), pace(loop.task), config.loop.labels, None, seconds + start["seconds/evaluate"] * evaluations

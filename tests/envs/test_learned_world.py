@@ -132,6 +132,41 @@ def test_held_out_steps_are_never_learned_from() -> None:
     assert worlds[1].held_out > worlds[0].held_out
 
 
+def falling(moves: int, steps: int = 100, seed: int = 0) -> Rollout:
+    """One episode that lies still after so many steps."""
+    rng, found = np.random.default_rng(seed), rollout(steps=steps)
+    places = np.zeros((1, steps + 1, 2), np.float32)
+    places[0, 1:] = rng.normal(size=2) + np.minimum(np.arange(1, steps + 1), moves)[:, None]
+    actions, ends = rng.normal(size=(1, steps, 2)).astype(np.float32), np.zeros((1, steps), bool)
+    if moves == 0:
+        places[:], actions[:] = 0.0, 0.0
+    seen: dict[str, Any] = {"observations": places[:, :-1], "final_observations": places[:, 1:], "actions": actions}
+    return replace(found, **seen, choices=actions, terminated=ends, truncated=ends, gold=np.zeros((1, steps)))
+
+
+@pytest.mark.parametrize(("moves", "held"), [(9, 1), (2, 1), (1, 0), (60, 6)])
+def test_of_a_play_that_soon_lies_still_most_is_learned_from(moves: int, held: int) -> None:
+    data = seen(falling(moves))
+    assert data.held_out[data.moves].sum() == held
+    metrics = world(fit_steps=2).fit(data, np.random.default_rng(0))
+    assert all(math.isfinite(value) for value in metrics.values())
+    assert metrics["world_steps"] == (0 if not held else (~data.held_out).sum())
+
+
+def test_where_nothing_moves_something_is_learned_from_all_the_same() -> None:
+    data = seen(falling(0))
+    assert (len(data), data.held_out.sum()) == (1, 0)
+
+
+def test_the_share_held_out_is_right_over_plays_that_are_short() -> None:
+    rng, data = np.random.default_rng(0), seen(falling(9))
+    for number in range(1, 41):
+        new = Transitions.of(falling(3 + number % 8, seed=number), 0.1, rng, data)
+        assert not new.held_out[new.moves].all()
+        data = data.joined(new)
+        assert data.held_out[data.moves].sum() == pytest.approx(0.1 * data.moves.sum(), abs=0.51)
+
+
 # --- How far it is trusted -------------------------------------------------------------------------------------------
 
 

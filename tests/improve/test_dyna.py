@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from control_stubs import Known, point
+from corridor import corridor
 from test_loop import leaves
 
 from prefrl.components import ConfigError
@@ -139,6 +140,7 @@ def test_questions_after_the_first_are_about_the_policy_as_it_is(store: Store[Se
     [
         ({"inside": {"device": "cpu"}}, r"inside\.device: write it as learner\.device"),
         ({"inside": {"evaluation_episodes": 3}}, r"write it as learner\.evaluation_episodes"),
+        ({"inside": {"rollback": 0.3}}, r"inside\.rollback: the learner inside keeps no best policy"),
         ({"inside": {"clone": {"keep": 0.1}}}, r"give its run as learner\.inside\.start"),
     ],
 )
@@ -156,6 +158,13 @@ class Texts:
 def test_other_tasks_are_refused() -> None:
     with pytest.raises(ConfigError, match="'dyna' plays real episodes of control"):
         DynaSettings().build(Texts(), np.random.default_rng(0))
+    with pytest.raises(ConfigError, match=r"in Corridor not all of them always are: use learner\.kind=control"):
+        dyna(corridor())
+
+
+def test_real_steps_grow_by_episodes_and_work_by_what_is_imagined() -> None:
+    settings = DynaSettings.model_validate({"episodes": 3, "inside": {"steps_per_round": 6400}})
+    assert (settings.work(), settings.real_work()) == (6400, 3)
 
 
 def test_a_shrunk_run_can_be_read_again() -> None:

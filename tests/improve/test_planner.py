@@ -11,15 +11,21 @@ import numpy as np
 import pytest
 import torch
 from control_stubs import Known, point
+from corridor import corridor
 from test_loop import leaves
 
 from prefrl.components import ConfigError
+from prefrl.config import Config
 from prefrl.improve.planner import Planner, PlannerSettings, Search
+from prefrl.stages.trial import estimate
 from prefrl.store import Store
 from prefrl.types import Floats, Segment, Steps
 
 WORLD: dict[str, Any] = {"members": 2, "hidden": (16,), "fit_steps": 300, "minibatch": 64, "learning_rate": 1e-2}
 SMALL: dict[str, Any] = {"candidates": 40, "plan": 6, "episodes": 2, "evaluation_episodes": 5, "device": "cpu"}
+
+FOLLOWS: dict[str, dict[str, Any]] = {"cem": {}, "mppi": {"temperature": 0.1}}
+"""With which each follows what is best."""
 
 
 @pytest.fixture
@@ -42,7 +48,7 @@ def rounds(learner: Planner, store: Store[Segment], numbers: range) -> None:
 
 @pytest.mark.parametrize("algorithm", ["cem", "mppi"])
 def test_it_comes_to_the_middle_without_a_policy(store: Store[Segment], algorithm: str) -> None:
-    learner = planner(algorithm=algorithm, temperature=0.2)
+    learner = planner(algorithm=algorithm, **FOLLOWS[algorithm])
     before = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
     rounds(learner, store, range(3))
     after = learner.evaluate(Known(), np.random.default_rng(9)).metrics["gold"]
@@ -95,7 +101,7 @@ def test_plans_are_no_longer_than_the_world_reaches_and_count_what_they_imagine(
 
 @pytest.mark.parametrize("algorithm", ["cem", "mppi"])
 def test_the_best_plan_is_found_and_a_plan_before_is_gone_on_from(algorithm: str) -> None:
-    found = search(algorithm=algorithm, iterations=5, temperature=0.1, candidates=60)
+    found = search(algorithm=algorithm, iterations=5, candidates=60, **FOLLOWS[algorithm])
     states = np.zeros((1, 1), np.float32)
     plans = found(states, np.random.default_rng(0), None)
     assert plans[0, 0, 0] > 0.7  # as much as there is
@@ -107,7 +113,7 @@ def test_cem_fits_the_best_sequences_and_mppi_weighs_all() -> None:
     plans, worth = np.arange(20.0).reshape(1, 20, 1, 1), np.arange(20.0)[None]
     mean, std = search(elites=0.1)._best(plans, worth)
     assert (mean.item(), std.item()) == (18.5, 0.5)
-    sharp, blunt = (search(temperature=t)._weighted(plans, worth).item() for t in (1e-3, 1e6))
+    sharp, blunt = (search(algorithm="mppi", temperature=t)._weighted(plans, worth).item() for t in (1e-3, 1e6))
     assert (sharp, blunt) == pytest.approx((19.0, 9.5), rel=1e-3)
 
 
@@ -160,7 +166,63 @@ def test_where_the_world_is_not_to_be_trusted_nothing_is_planned_and_it_says_so(
     assert learner.improve(Known(), store, rng)["reach"] == 0
     found = learner.evaluate(Known(), np.random.default_rng(2))
     assert learner.steps.imagined == 0
+    assert "cannot be trusted" in found.notes[0]
     assert "has stopped dreaming" in found.notes[0]
+    again = planner()
+    again.load(deepcopy(learner.state()))
+    assert again.evaluate(Known(), np.random.default_rng(2)).notes == found.notes
+
+
+def test_a_world_that_cannot_be_tested_is_not_trusted_and_the_note_has_numbers_or_none() -> None:
+    ground = planner().ground
+    ground.play(1, lambda observations, *_: (np.zeros_like(observations),) * 2, np.random.default_rng(0))
+    assert ground.learn(np.random.default_rng(1)) == {"world_steps": 0.0, "reach": 0.0}
+    assert "no held-out step says how good it is" in ground.notes[0]
+    assert "nan" not in ground.notes[0]
+
+
+def test_a_dry_run_scales_real_steps_by_real_episodes_alone() -> None:
+    given = "learner.kind=planner", "learner.evaluation_episodes=1"
+    narrow, wide, longer = (
+        estimate(Config.load("control/toy", [*given, more]))
+        for more in ("learner.candidates=20", "learner.candidates=1000", "learner.episodes=3")
+    )
+    assert narrow.steps == wide.steps
+    assert longer.steps > 2 * narrow.steps
+    assert wide.machine > narrow.machine
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        (
+            {"algorithm": "mcts", "candidates": 40},
+            "candidates is a setting of cem and mppi, and algorithm=mcts has none",
+        ),
+        ({"algorithm": "mcts", "elites": 0.3}, "elites is a setting of cem, and algorithm=mcts has none"),
+        ({"algorithm": "mcts", "world": {"members": 2}}, "world is a setting of cem and mppi"),
+        ({"algorithm": "mppi", "elites": 0.3}, "elites is a setting of cem, and algorithm=mppi has none"),
+        ({"temperature": 0.1}, "temperature is a setting of mppi, and algorithm=cem has none"),
+        ({"simulations": 9}, "simulations is a setting of mcts"),
+        ({"algorithm": "mppi", "epsilon": 0.0}, "epsilon is a setting of mcts"),
+    ],
+)
+def test_settings_of_another_algorithm_are_refused_by_name(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        PlannerSettings.model_validate(settings)
+
+
+@pytest.mark.parametrize("algorithm", ["cem", "mppi", "mcts"])
+def test_what_was_saved_or_shrunk_can_be_read_again(algorithm: str) -> None:
+    given = PlannerSettings.model_validate({"algorithm": algorithm})
+    for one in (given, given.shrunk()):
+        assert PlannerSettings.model_validate(one.model_dump()) == one
+
+
+def test_what_a_search_takes_grows_by_what_it_tries() -> None:
+    tree = PlannerSettings.model_validate({"algorithm": "mcts", "simulations": 50, "plan": 7, "episodes": 3})
+    assert (tree.work(), tree.real_work()) == (350, 3)
+    assert PlannerSettings(plan=5, candidates=10, iterations=2).work() == 100
 
 
 class Unbounded:
@@ -175,3 +237,5 @@ def test_actions_that_cannot_be_drawn_are_refused() -> None:
         planner(point(discrete=True))
     with pytest.raises(ConfigError, match="those of Free have none"):
         planner(Unbounded())
+    with pytest.raises(ConfigError, match=r"in Corridor not all of them always are: use learner\.kind=control"):
+        planner(corridor())

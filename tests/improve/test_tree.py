@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from control_stubs import Known, point
+from control_stubs import Known, Point, point
+from corridor import corridor
 from small_worlds import world
 from test_loop import leaves
 
 from prefrl.components import ConfigError
 from prefrl.envs import exact
 from prefrl.envs.counted import Counted
+from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.tabular import GridworldSettings
 from prefrl.envs.toys import ToyTask
 from prefrl.improve.planner import PlannerSettings
@@ -131,6 +133,20 @@ def test_the_last_round_plays_nothing_more(store: Store[Segment]) -> None:
     assert learner.steps.learn == 8 * 20  # at random, since nothing was known
 
 
-def test_states_that_cannot_be_counted_are_refused() -> None:
+class Begins(Point):
+    """Every episode begins where it is seen one-hot."""
+
+    def start(self, count: int, rng: np.random.Generator) -> Floats:
+        return np.ones((count, 1))
+
+
+def test_tasks_that_cannot_be_counted_are_refused() -> None:
     with pytest.raises(ConfigError, match="have to be seen one-hot"):
         planner(point(discrete=True))
+    later = replace(point(discrete=True), make=lambda n: Vectorised(Begins(), n, 20))
+    with pytest.raises(ConfigError, match=r"Point shows \[0\.8\]: use learner\.kind=dyna"):
+        planner(later)
+    with pytest.raises(ConfigError, match=r"those of Point are continuous: use learner\.algorithm=cem"):
+        planner(point())
+    with pytest.raises(ConfigError, match=r"in Corridor not all of them always are: use learner\.kind=control"):
+        planner(corridor())

@@ -17,11 +17,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from prefrl import load_policy
 from prefrl.components import ConfigError
+from prefrl.config import Config
 from prefrl.envs.control import ControlSettings
 from prefrl.improve.control import ControlLearner, ControlLearnerSettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
 from prefrl.policies.zips import read_zip
-from prefrl.rundir import RunError, open_saved
+from prefrl.rundir import Run, RunError, open_saved
+from prefrl.stages import shrink
+from prefrl.stages.policies import export_sb3
 from prefrl.store import Store
 from prefrl.types import Segment
 
@@ -184,3 +187,12 @@ def test_every_query_of_several_policies_mixes_them(prefrl: Shell) -> None:
     assert "two sources of candidates" in prefrl.err
     assert prefrl("label control/cartpole --policy a.zip --out other") == 2
     assert "expected a policy for CartPole-v1" in prefrl.err
+
+
+def test_a_planner_has_no_policy_to_load_and_says_so(tmp_path: Path) -> None:
+    with Run(shrink(Config.load("control/gridworld-planner")), tmp_path / "run") as run:
+        list(run)
+    with pytest.raises(RunError, match=r"learner\.kind=planner has no policy to load"):
+        load_policy(tmp_path / "run")
+    with pytest.raises(RunError, match=r"learner\.kind=planner has no policy to load"):
+        export_sb3(tmp_path / "run", tmp_path / "policy.zip")

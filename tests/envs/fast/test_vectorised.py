@@ -8,7 +8,7 @@ from corridor import LEFT, RIGHT, STAY, Corridor
 
 from prefrl.envs.control import WORLDS, ControlSettings
 from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
-from prefrl.envs.fast.vectorised import Vectorised
+from prefrl.envs.fast.vectorised import Vectorised, _check
 from prefrl.envs.toys import INK, Point, PointSettings
 from prefrl.protocols import Dynamics
 from prefrl.types import Segment
@@ -65,6 +65,13 @@ def test_a_move_that_is_not_legal_is_refused_and_nothing_moves() -> None:
         envs.step(np.stack([LEFT, LEFT, LEFT]))
     assert envs.states().tolist() == [[1.0], [0.0], [3.0]]
     assert envs.step(np.stack([LEFT, RIGHT, LEFT])).observations.tolist() == [[0.0], [1.0], [2.0]]
+
+
+def test_of_many_legal_moves_some_are_named() -> None:
+    legal = np.ones((1, 1000), bool)
+    legal[0, 3] = False
+    with pytest.raises(ValueError, match=r"expected one of \[0, 1, 2, 4, 5, 6, 7, 8, 9, 10, \.\.\.\]: use"):
+        _check(np.eye(1000, dtype=np.float32)[3:4], legal)
 
 
 @pytest.mark.parametrize("name", EVERY)
