@@ -60,7 +60,7 @@ class DigitsSettings(Settings):
         return self.model_copy(update={"denoiser": self.denoiser.model_copy(update=small)})
 
     def identity(self) -> Self:
-        """Without the starting policy: a reward model hangs on the captions alone."""
+        """Without the starting policy: a reward model depends on the captions alone."""
         return self.model_copy(update={"denoiser": DenoiserSettings()})
 
     def build(self) -> Digits:
@@ -90,6 +90,10 @@ class Digits:
     @property
     def shape(self) -> tuple[int, ...]:
         return self.pixels.shape[1:]
+
+    @property
+    def ungraded(self) -> tuple[str, ...]:
+        return tuple(caption for caption in self.captions if caption == MINE)
 
     def denoiser(self) -> Denoiser:
         return copy.deepcopy(self._start)

@@ -19,6 +19,7 @@ from prefrl.fit.settings import FittingSettings, check_settings, check_shown
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
+    GoesByGold,
     Imitates,
     Labeler,
     LabelerSettings,
@@ -26,6 +27,7 @@ from prefrl.protocols import (
     LearnerSettings,
     NeedsShowing,
     Particular,
+    PartlyGraded,
     RewardModel,
     RewardSettings,
     SelectorSettings,
@@ -153,6 +155,7 @@ class Config(Settings):
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         labeler = self.build_labeler(task)
         self._check_labeler(labeler, learner)
+        self._check_gold(labeler, task)
         if store is not None:  # which is with the first of several ranks alone
             shows = _shows(labeler) or bool(store.demonstrations())
             check_shown(self.fitting, shows)
@@ -202,6 +205,16 @@ class Config(Settings):
                 f"learner.kind={self.learner.model_dump()['kind']} learns nothing from demonstrations, and the labeler "
                 "gives no other answers: set fitting.demonstrations=1, for a reward that is fitted on them, or "
                 "learner.kind=clone"
+            )
+
+    def _check_gold(self, labeler: Labeler, task: Task) -> None:
+        """Raises `ConfigError` where somebody who goes by gold would be asked about what has none."""
+        if not (self.loop.labels and isinstance(labeler, GoesByGold) and labeler.by_gold):
+            return
+        if isinstance(task, PartlyGraded) and task.ungraded:
+            raise ConfigError(
+                f"labeler.kind={self.labeler.model_dump()['kind']} goes by gold, and there is none for the captions "
+                f"{', '.join(task.ungraded)}: set labeler.kind=web to judge yourself, or ask for other captions"
             )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

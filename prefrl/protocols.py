@@ -324,6 +324,21 @@ def pictures(task: Task, what: str) -> PictureTask:
     return cast(PictureTask, task)
 
 
+@runtime_checkable
+class PartlyGraded(Protocol):
+    """A task that knows no gold of some of what it asks for."""
+
+    @property
+    def ungraded(self) -> Sequence[str]:
+        """The captions that have none."""
+
+
+def caption_numbers(task: PictureTask, captions: Iterable[str]) -> list[int]:
+    """Which of the task's captions each is, counted from 0."""
+    known = {caption: at for at, caption in enumerate(task.captions)}
+    return [known[caption] for caption in captions]
+
+
 class Labeler(Protocol[C]):
     """Who answers."""
 
@@ -377,6 +392,15 @@ class Advises(Protocol):
     @property
     def wavers(self) -> bool:
         """Whether it does not do so in all of its own episodes, and so is no measure."""
+
+
+@runtime_checkable
+class GoesByGold(Protocol):
+    """A labeler that may read the hidden gold."""
+
+    @property
+    def by_gold(self) -> bool:
+        """Whether it does, and so cannot answer where there is none."""
 
 
 @runtime_checkable

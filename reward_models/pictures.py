@@ -20,7 +20,7 @@ from torch import Tensor
 from prefrl.components import Settings
 from prefrl.kinds import kind_of
 from prefrl.policies.perceptron import Activation
-from prefrl.protocols import ControlTask, PictureTask, Task, pictures
+from prefrl.protocols import ControlTask, PictureTask, Task, caption_numbers, pictures
 from prefrl.reward_models.cnn import CNN, CNNSettings
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
@@ -139,11 +139,10 @@ class PictureReward:
         self.steps.load(state)
 
     def _segments(self, candidates: Sequence[Picture]) -> list[Segment]:
-        known, captions = {caption: i for i, caption in enumerate(self.task.captions)}, len(self.task.captions)
-        rows = np.eye(captions, dtype=np.float32)
         for one in candidates:
             if misfit := kind_of(one).misfit(one, self.task):
                 raise ValueError(f"picture {one.id[:12]} {misfit}")
+        numbers = caption_numbers(self.task, (one.caption for one in candidates))
         observed = (one.pixels.reshape(1, -1) / np.float32(BRIGHTEST) for one in candidates)
-        done = (rows[[known[one.caption]]] for one in candidates)
+        done = np.eye(len(self.task.captions), dtype=np.float32)[numbers, None]  # (N, 1, A)
         return [Segment(o, a, "", 0) for o, a in zip(observed, done, strict=True)]

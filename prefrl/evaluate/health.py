@@ -26,8 +26,9 @@ def warnings(round: int, metrics: Mapping[str, float]) -> dict[str, str]:
         )
     if metrics.get("improve/equal_groups", 0.0) == 1:
         found["reward"] = (
-            "all responses to a prompt had one reward, for every prompt of the round: nothing was learned from it; "
-            "look at the reward (is it constant?), or raise learner.responses"
+            "all candidates of each group (responses to a prompt, pictures for a caption) had one reward, in every "
+            "group of the round: nothing was learned from it; look at the reward (is it constant?), or let groups be "
+            "larger"
         )
     if abs(bias := metrics.get("label/position_bias", 0.0)) > UNFAIR:
         first = "first" if bias > 0 else "last"

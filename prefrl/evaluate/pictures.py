@@ -19,25 +19,21 @@ def drawn(
 ) -> tuple[Evaluation[Picture], int]:
     """About so many pictures, as many of each caption, and how many there are.
 
-    Metrics: count, gold and gold_std (of the captions that have a gold), learned, kl (nats a picture: the mean over
-    chains of the steps' exact KL to the starting policy, added up), spread (see the task), and gold/CAPTION where there
-    are several.
+    Metrics: count, learned, kl (nats a picture: the mean over chains of the steps' exact KL to the starting policy,
+    added up) and spread (see the task). Of the captions that have a gold: gold, gold_std, and gold/CAPTION where there
+    are several captions.
     """
     captions = list(policy.task.captions)
     chains = policy.draw(evenly(captions, -(-count // len(captions)) * len(captions)), rng)
     found = policy.with_gold(chains)
     gold = np.array([one.gold for one in found], float)[:, 0]
-    known = gold[~np.isnan(gold)]
     metrics = {
         "count": float(len(found)),
-        "gold": float(known.mean()) if len(known) else float("nan"),
-        "gold_std": float(known.std()) if len(known) else float("nan"),
+        **_golds(found, gold),
         "learned": float(reward.score(found).mean()),
         "kl": float(policy.kl(chains).sum(1).mean()),
         "spread": policy.task.spread(found),
     }
-    if len(captions) > 1:
-        metrics |= _by_caption(found, gold)
     return Evaluation(metrics, tuple(found[:EXAMPLES]), candidates=tuple(found)), len(found)
 
 
@@ -46,6 +42,13 @@ def evenly(captions: Sequence[str], count: int) -> list[str]:
     return [captions[i % len(captions)] for i in range(count)]
 
 
-def _by_caption(found: Sequence[Picture], gold: Floats) -> Metrics:
+def _golds(found: Sequence[Picture], gold: Floats) -> Metrics:
+    """Of pictures with a gold (N,), NaN for those without one; by caption too, where there are several."""
+    known = ~np.isnan(gold)
+    if not known.any():
+        return {}
+    metrics = {"gold": float(gold[known].mean()), "gold_std": float(gold[known].std())}
     which = np.array([one.caption for one in found])
-    return {f"gold/{caption}": float(gold[which == caption].mean()) for caption in dict.fromkeys(which.tolist())}
+    if len(set(which)) > 1:
+        metrics |= {f"gold/{one}": float(gold[which == one].mean()) for one in dict.fromkeys(which[known].tolist())}
+    return metrics

@@ -87,10 +87,10 @@ class _Pairs:
 
     @classmethod
     def of(cls, data: Batch[Picture], policy: DenoiserPolicy) -> _Pairs:
-        known = {caption: at for at, caption in enumerate(policy.task.captions)}
         flat = np.stack([one.pixels.ravel() for one in data.candidates]).astype(np.float32) / 127.5 - 1
-        which = torch.tensor([known[one.caption] for one in data.candidates], device=policy.device)
-        return cls(data, torch.from_numpy(flat).to(policy.device), which)
+        return cls(
+            data, torch.from_numpy(flat).to(policy.device), policy.numbers(one.caption for one in data.candidates)
+        )
 
 
 class DiffusionDPO:
@@ -141,7 +141,7 @@ class DiffusionDPO:
     def _parts(self, pairs: _Pairs, at: Integers, noise: torch.Generator) -> Parts:
         """Both pictures of a pair go through the network in one pass, with one noise at one level."""
         settings, data, device = self._settings, pairs.data, self.policy.device
-        # Of the whole minibatch, so that the numbers do not hang on the parts.
+        # Of the whole minibatch, so that the numbers do not depend on the parts.
         added = torch.randn(len(at), pairs.pixels.shape[1], generator=noise)
         level = torch.randint(2, self.policy.model.steps + 1, (len(at),), generator=noise)
         for part in in_parts(np.arange(len(at)), max(1, settings.policy.chunk // 2)):

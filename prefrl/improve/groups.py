@@ -1,4 +1,4 @@
-"""What policy gradients on groups of samples share: responses to a prompt, or pictures for a caption."""
+"""The part that policy gradients on groups of samples share: responses to a prompt, or pictures for a caption."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def advantages_of(returns: Tensor, how: str) -> Tensor:
 
 @dataclass(frozen=True)
 class Weighing:
-    """How scores and KL become advantages."""
+    """The way from scores and KL to advantages."""
 
     advantage: str
     """See `ADVANTAGES`."""

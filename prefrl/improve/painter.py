@@ -1,4 +1,4 @@
-"""What the learners of pictures share: a denoiser that is sampled, evaluated, counted and saved."""
+"""The part that learners of pictures share: a denoiser that is sampled, evaluated, counted and saved."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ class Painter:
         self.policy.to(device_of(device))
         self.optimizer = adam(self.policy.parameters(), learning_rate)
         self.steps = Steps()
+        self._turns = list[str]()
+        """Captions that are still to come before all come again."""
 
     def ask(self, count: int, rng: np.random.Generator) -> list[Picture]:
         """At least `count` pictures to be asked about, as many of each caption, gold attached."""
@@ -31,9 +33,14 @@ class Painter:
         return self.policy.with_gold(chains)
 
     def paint(self, groups: int, each: int, rng: np.random.Generator) -> Chains:
-        """A batch to learn from: `each` pictures for every one of so many captions, in a random order."""
-        captions = [str(caption) for caption in rng.permutation(self.task.captions)]
-        chains = self.policy.draw([one for one in evenly(captions, groups) for _ in range(each)], rng)
+        """A batch to learn from: `each` pictures for every one of so many captions.
+
+        All captions come in a random order before any comes again, however many batches that takes.
+        """
+        while len(self._turns) < groups:
+            self._turns += [str(caption) for caption in rng.permutation(self.task.captions)]
+        now, self._turns = self._turns[:groups], self._turns[groups:]
+        chains = self.policy.draw([caption for caption in now for _ in range(each)], rng)
         self.steps = self.steps.add(learn=len(chains))
         return chains
 
@@ -50,6 +57,7 @@ class Painter:
             "model": self.policy.state(),
             "optimizer": optimizer,
             "steps": list(self.steps),
+            "turns": list(self._turns),
             "start": self.policy.start_digest(),
         }
 
@@ -63,3 +71,4 @@ class Painter:
         self.policy.load(state["model"])
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.steps = Steps(*state["steps"])
+        self._turns = list(state.get("turns", []))  # older ones have none

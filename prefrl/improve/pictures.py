@@ -43,9 +43,9 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "ddpo": {"clip": 0.2, "minibatches": 2},
     "dpok": {"kl_in": "loss"},
 }
-"""Where their defaults are others than those of the fields below."""
+"""Defaults that differ from those of the fields below."""
 RATIO_TOLERANCE = 1e-3
-"""It is exactly 0 where a row's products do not hang on the others beside it."""
+"""It is exactly 0 where a row's products do not depend on the others beside it."""
 
 
 class PictureLearnerSettings(Settings):
@@ -105,7 +105,10 @@ class PictureLearnerSettings(Settings):
     @model_validator(mode="after")
     def _consistent(self) -> PictureLearnerSettings:
         if self.clip is None and self.epochs * self.minibatches > 1:
-            raise ValueError("several gradient steps on a batch (epochs x minibatches > 1) need a clip: set clip=0.2")
+            raise ValueError(
+                "several gradient steps on a batch (epochs x minibatches > 1) need a clip: set clip=0.2, or epochs=1 "
+                "and minibatches=1"
+            )
         if self.minibatches > self.groups * self.pictures:
             raise ValueError(f"{self.groups} x {self.pictures} pictures cannot be {self.minibatches} minibatches")
         if self.kl_target is not None and self.beta == 0:
@@ -210,9 +213,10 @@ class PictureLearner:
         found = reward.score(drawn.candidates(self._task.captions))  # (B,)
         raw, varied = torch.as_tensor(found, dtype=torch.float32, device=device), apart(drawn.pixels, size)
         scores = finite("reward", raw + settings.diversity * varied, self._updates)
-        kl, how = self.policy.kl(drawn).sum(1), Weighing(settings.advantage, settings.kl_in, self._kl.beta)
-        ratios = kl_k1(drawn.logp, self.policy.start_logp(drawn))  # (B, L)
-        batch = Batch(drawn, drawn.logp, by_group(scores, ratios, drawn.mask, size, how).view(-1, 1))
+        how = Weighing(settings.advantage, settings.kl_in, self._kl.beta)
+        start, kls = self.policy.start_logp_and_kl(drawn)  # (B, L) each
+        kl = kls.sum(1)
+        batch = Batch(drawn, drawn.logp, by_group(scores, kl_k1(drawn.logp, start), drawn.mask, size, how).view(-1, 1))
         rows = minibatches(len(batch), settings.epochs, settings.minibatches, rng, device)
         steps = update(self.policy, self._painter.optimizer, batch, rows, self._objective(), settings.policy.chunk)
         check_ratio(steps[0]["ratio_error"], RATIO_TOLERANCE, self._updates, "lower learner.policy.chunk")
@@ -224,7 +228,7 @@ class PictureLearner:
             "apart": float(varied.mean()),
             "kl": float(kl.mean()),
             "beta": self._kl.beta,
-            **equal_groups(scores.view(-1, size)),
+            **equal_groups(raw.view(-1, size)),
         }
 
     def _objective(self) -> Objective:

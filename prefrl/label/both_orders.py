@@ -1,4 +1,4 @@
-"""What judges share that are asked about each pair twice, in both orders: verdicts, and what a query comes to."""
+"""Verdicts of judges that are asked about each pair twice, in both orders, and the answer that a query comes to."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EQUAL = 1e-5
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the judge made of one pair of texts."""
+    """A judgement of one pair of candidates, in both orders."""
 
     forward: float
     """The probability that the first is better, where it was shown first; NaN for a refusal."""
@@ -63,7 +63,7 @@ def conclude(query: Query[C], verdicts: Sequence[Verdict], name: str) -> Answer:
 
 
 def bias(verdicts: Sequence[Verdict]) -> Metrics:
-    """How much the order decides: `pairs`, `refused`, `position_bias` and `flipped`.
+    """Measure how much the order decides: `pairs`, `refused`, `position_bias` and `flipped`.
 
     `refused` is the share of pairs without a verdict. Over the others, `position_bias` is the mean probability given
     to what is shown first, minus 0.5, and `flipped` the share whose winner changes with the order.

@@ -57,6 +57,10 @@ class Crowd:
     annotators: tuple[Oracle, ...]
     name: str = "crowd"
 
+    @property
+    def by_gold(self) -> bool:
+        return any(one.by_gold for one in self.annotators)
+
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
         """A query that all annotators skip stays open, in its place, for another labeler."""
         base = draw_seed(rng)

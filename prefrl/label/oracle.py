@@ -129,6 +129,10 @@ class Oracle:
     def name(self) -> str:
         return self.settings.name
 
+    @property
+    def by_gold(self) -> bool:
+        return self.measure is None
+
     def answer(self, store: Store[C], rng: np.random.Generator) -> None:
         """Each answer hangs on its query and on the set of queries asked so far, not on the order of either.
 

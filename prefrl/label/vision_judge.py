@@ -7,10 +7,12 @@ them. What is no answer is a refusal, and what comes too late, after `retries`, 
 from __future__ import annotations
 
 import base64
+import http.client
 import io
 import json
 import math
 import re
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Sequence
@@ -21,7 +23,7 @@ from typing import Any, Literal, Self, cast
 
 import numpy as np
 from PIL import Image
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from prefrl.components import ConfigError, Settings
 from prefrl.label.both_orders import Verdict, answer_open
@@ -30,6 +32,8 @@ from prefrl.types import Metrics, Picture, Query
 
 LONGEST = 1_000_000
 """Bytes of a reply that are read at most."""
+LEADS = "the|final|better|answer|picture|is"
+"""Words that may stand before an answer, in capitals or not: `Answer: B`, `Picture A`, `The answer is B`."""
 
 
 class VisionJudgeSettings(Settings):
@@ -53,9 +57,19 @@ class VisionJudgeSettings(Settings):
     timeout_seconds: float = Field(60.0, gt=0)
     """How long one reply may take."""
     retries: int = Field(1, ge=0)
-    """How often a question is asked again after it took too long, or the server failed."""
+    """How often a question is asked again after it took too long, the connection broke, or the server failed."""
+    pause_seconds: float = Field(1.0, ge=0)
+    """How long to wait before a question is asked again; twice as long each further time."""
     at_once: int = Field(4, ge=1)
     """Questions that are under way at the same time."""
+
+    @field_validator("answers")
+    @classmethod
+    def _differ(cls, answers: tuple[str, str]) -> tuple[str, str]:
+        first, second = (answer.strip() for answer in answers)
+        if not first or not second or first == second:
+            raise ValueError(f"expected two answers that differ, neither empty, got {list(answers)}")
+        return first, second
 
     def asking(self, goal: str) -> Self:
         own = self.criterion != type(self).model_fields["criterion"].default
@@ -104,22 +118,31 @@ class VisionJudge:
 
     def _ask(self, pair: tuple[Picture, Picture]) -> float:
         """1 where the first picture shown is said to be better, 0 where the second is; NaN for anything else."""
-        for _ in range(self.settings.retries + 1):
+        question = self._question(*pair)
+        for turn in range(self.settings.retries + 1):
+            if turn:
+                time.sleep(self.settings.pause_seconds * 2 ** (turn - 1))
             try:
-                return read_reply(self._sent(self._question(*pair)), self.settings.answers)
-            except urllib.error.HTTPError as error:
-                if error.code < 500 and error.code not in (408, 429):
-                    said = error.read(300).decode("utf-8", "replace")
-                    raise ConfigError(f"labeler.address: the server refuses with {error.code}: {said}") from error
-            except TimeoutError:
-                continue
-            except urllib.error.URLError as error:
-                if not isinstance(error.reason, TimeoutError):
-                    raise ConfigError(
-                        f"labeler.address: nobody answers at {self.settings.address} ({error.reason}): start the "
-                        "server, or set its address"
-                    ) from error
+                return read_reply(self._sent(question), self.settings.answers)
+            except (urllib.error.URLError, TimeoutError, ConnectionError, http.client.HTTPException) as error:
+                self._check_passing(error)
         return math.nan
+
+    def _check_passing(self, error: Exception) -> None:
+        """Raises `ConfigError` for what asking again will not mend."""
+        address = self.settings.address
+        if isinstance(error, urllib.error.HTTPError):
+            if error.code < 500 and error.code not in (408, 429):
+                said = error.read(300).decode("utf-8", "replace")
+                raise ConfigError(f"labeler.address: the server refuses with {error.code}: {said}") from error
+        elif isinstance(error, urllib.error.URLError):
+            why = error.reason
+            if not isinstance(why, TimeoutError | ConnectionError) or isinstance(why, ConnectionRefusedError):
+                raise ConfigError(
+                    f"labeler.address: nobody answers at {address} ({why}): start the server, or set its address"
+                ) from error
+        elif isinstance(error, http.client.InvalidURL):
+            raise ConfigError(f"labeler.address: {address} is no address: {error}") from error
 
     def _question(self, first: Picture, second: Picture) -> dict[str, Any]:
         a, b = self.settings.answers
@@ -145,8 +168,11 @@ class VisionJudge:
         address = f"{self.settings.address.rstrip('/')}/chat/completions"
         request = urllib.request.Request(address, json.dumps(question).encode(), headers)
         with urllib.request.urlopen(request, timeout=self.settings.timeout_seconds) as reply:
+            said = reply.read(LONGEST)
+            if reply.length and len(said) < LONGEST:  # with a limit, a short read passes for a whole one
+                raise http.client.IncompleteRead(said, reply.length)
             try:
-                return cast(object, json.loads(reply.read(LONGEST)))
+                return cast(object, json.loads(said))
             except ValueError as error:
                 raise ConfigError(
                     f"labeler.address: what answers at {self.settings.address} does not speak JSON"
@@ -154,14 +180,16 @@ class VisionJudge:
 
 
 def read_reply(reply: object, answers: tuple[str, str]) -> float:
-    """1 or 0 for a reply that begins with the first or the second answer as a word of its own, NaN for another."""
+    """1 or 0 for a reply that is the first or the second answer, NaN for another.
+
+    Punctuation may stand around it, and one of `LEADS` before it. What goes on is no answer: "A three is clearer in B".
+    """
     try:
         said = cast(Any, reply)["choices"][0]["message"]["content"]
     except (TypeError, KeyError, IndexError):
         return math.nan
     if not isinstance(said, str):  # a model that refuses says nothing
         return math.nan
-    for answer, value in zip(answers, (1.0, 0.0), strict=True):
-        if re.match(rf"\W*{re.escape(answer)}(?!\w)", said):
-            return value
-    return math.nan
+    lead = rf"[\W_]*(?:(?i:{LEADS})(?:[\W_]+|$))*"
+    first, second = (re.fullmatch(rf"{lead}{re.escape(one)}[\W_]*", said) is not None for one in answers)
+    return float(first) if first != second else math.nan

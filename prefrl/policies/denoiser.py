@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -21,7 +21,7 @@ from pydantic import Field
 from torch import Tensor
 
 from prefrl.components import Settings
-from prefrl.protocols import PictureTask
+from prefrl.protocols import PictureTask, caption_numbers
 from prefrl.seeding import generator, to_numpy
 from prefrl.types import Picture, State
 
@@ -123,7 +123,7 @@ class DenoisingSettings(Settings):
     """How much of a policy of pictures goes through its network at once."""
 
     chunk: int = Field(512, ge=1)
-    """Chains in one pass of the network while learning: changes memory and speed, and nothing else."""
+    """Chains in one pass of the network: changes memory and speed, and results by rounding only."""
 
 
 @dataclass(frozen=True)
@@ -182,14 +182,23 @@ class DenoiserPolicy:
         return *self.log_prob(inputs), self.values(inputs)
 
     @torch.no_grad()
-    def start_logp(self, chains: Chains) -> Tensor:
-        """(B, L) log-probabilities under the starting policy."""
-        return self._in_parts(lambda some: self._logp(some, self._clean(self.start, some)), chains)
+    def start_logp_and_kl(self, chains: Chains) -> tuple[Tensor, Tensor]:
+        """(B, L) log-probabilities under the starting policy, and the KL of each step to it, from one pass of it.
+
+        The KL is exact given the step's beginning.
+        """
+        logp, kl = [], []
+        for some in self._parts(chains):
+            start = self._clean(self.start, some)
+            logp.append(self._logp(some, start))
+            kl.append(self._kl(self._clean(self.model, some), start))
+        return torch.cat(logp), torch.cat(kl)
 
     @torch.no_grad()
     def kl(self, chains: Chains) -> Tensor:
         """(B, L) KL of each step to the starting policy, exact given the step's beginning."""
-        return self._in_parts(lambda some: self.log_prob_and_kl(some)[1], chains)
+        parts = self._parts(chains)
+        return torch.cat([self._kl(self._clean(self.model, x), self._clean(self.start, x)) for x in parts])
 
     def gains(self, pixels: Tensor, captions: Tensor, levels: Tensor, noise: Tensor) -> Tensor:
         """(R,) how much more probable pictures (R, D) have become than they were at the start, in nats; differentiable.
@@ -206,11 +215,17 @@ class DenoiserPolicy:
     @torch.no_grad()
     def draw(self, captions: Sequence[str], rng: np.random.Generator) -> Chains:
         """A chain for each caption."""
-        known = {caption: at for at, caption in enumerate(self.task.captions)}
-        which = torch.tensor([known[caption] for caption in captions], device=self.device)
-        noise = generator(rng)
-        parts = [self._draw(some, noise) for some in which.split(self.part)]  # type: ignore[no-untyped-call]
+        which, source = self.numbers(captions), generator(rng)
+        size = (len(which), self.model.enter.in_features)
+        # Of all chains, so that the pictures do not depend on the parts; (B, T, D): first what a chain begins with.
+        noise = torch.stack([torch.randn(size, generator=source) for _ in range(self.model.steps)], 1)
+        pairs = zip(which.split(self.part), noise.split(self.part), strict=True)  # type: ignore[no-untyped-call]
+        parts = [self._draw(some, added.to(self.device)) for some, added in pairs]
         return Chains(which, *(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def numbers(self, captions: Iterable[str]) -> Tensor:
+        """(N,) int64: which of the task's captions each is."""
+        return torch.tensor(caption_numbers(self.task, captions), device=self.device)
 
     def with_gold(self, chains: Chains) -> list[Picture]:
         """As candidates, gold attached: for what is asked about, and for evaluation."""
@@ -238,14 +253,13 @@ class DenoiserPolicy:
                 raise ValueError(f"policy: {name} is missing or has another shape: it was made by other settings")
             parameter.copy_(found)  # in place: the optimiser holds these very tensors
 
-    def _draw(self, captions: Tensor, noise: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """States (b, L + 1, D), log-probabilities (b, L) and pixels (b, H, W) of some chains."""
-        size = (len(captions), self.model.enter.in_features)
-        states, logp = [torch.randn(size, generator=noise).to(self.device)], []
+    def _draw(self, captions: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States (b, L + 1, D), log-probabilities (b, L) and pixels (b, H, W) of some chains, from noise (b, T, D)."""
+        states, logp = [noise[:, 0]], []
         for level in range(self.model.steps, 1, -1):
             clean = _of_rows(self.model, states[-1], torch.full_like(captions, level), captions)
             mean, variance = self._mean(clean, states[-1], level), self._steps.variance[level]
-            states.append(mean + variance.sqrt() * torch.randn(size, generator=noise).to(self.device))
+            states.append(mean + variance.sqrt() * noise[:, len(states)])
             logp.append(_gaussian(states[-1], mean, variance))
         last = _of_rows(self.start, states[-1], torch.ones_like(captions), captions)
         pixels = ((last + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
@@ -281,8 +295,8 @@ class DenoiserPolicy:
         """(T + 1,): nats of a step for each square of what is expected behind the noise."""
         return self._steps.of_clean.square() / (2 * self._steps.variance)
 
-    def _in_parts(self, found: Callable[[Chains], Tensor], chains: Chains) -> Tensor:
-        return torch.cat([found(chains.rows(at)) for at in chains.order().split(self.part)])  # type: ignore[no-untyped-call]
+    def _parts(self, chains: Chains) -> list[Chains]:
+        return [chains.rows(at) for at in chains.order().split(self.part)]  # type: ignore[no-untyped-call]
 
 
 def _columns(steps: _Steps) -> tuple[Tensor, Tensor, Tensor]:

@@ -95,7 +95,7 @@ class DenoiserSettings(Settings):
                 _loss(model, shown, self.batch_size, order).backward()  # type: ignore[no-untyped-call]
                 optimizer.step()
                 for name, value in model.named_parameters():
-                    # The average of a short run must not hang on where it started.
+                    # The average of a short run must not depend on where it started.
                     kept[name].lerp_(value.detach(), max(1 - self.average, 1 / (number + 1)))
         return {name: value for name, value in kept.items() if not name.startswith("captions.")}
 

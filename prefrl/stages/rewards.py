@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from prefrl.components import ConfigError, flat
@@ -12,7 +12,9 @@ from prefrl.evaluate.card import ReportCard
 from prefrl.evaluate.grade import Subject, grade, of_judgements, of_run
 from prefrl.evaluate.summary import read_metrics
 from prefrl.exchange.layout import Which
+from prefrl.exchange.reading import read_rows
 from prefrl.exchange.source import open_judgements
+from prefrl.exchange.text_rows import form_of
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
@@ -30,10 +32,21 @@ def config_of(source: Path, config: str | None) -> str:
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder")
     if config is None and source.is_file():
-        raise ConfigError(f"{source} is a file of judgements: say which settings to use, --config text/replies say")
+        raise ConfigError(
+            f"{source} is a file of judgements: say which settings to use, --config {_preset_for(source)} say"
+        )
     if config is None and not (source / "config.yaml").is_file():
         raise ConfigError(f"{source} has no config.yaml: say which settings to use with --config PRESET_OR_FILE")
     return config or str(source)
+
+
+def _preset_for(file: Path) -> str:
+    """One that fits what a file begins with, by its columns; the one for texts where they say nothing."""
+    try:
+        row = next(iter(read_rows(file)), None)
+    except (ValueError, OSError, ImportError):  # said when it is read
+        row = None
+    return "pictures/digits" if isinstance(row, Mapping) and form_of(row) == "pick-a-pic" else "text/replies"
 
 
 def fit_reward(config: Config, source: Path, out: Path, which: Which | None = None) -> tuple[Fitted, tuple[str, ...]]:

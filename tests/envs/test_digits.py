@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from prefrl.components import ConfigError
 from prefrl.config import Config
 from prefrl.envs.digits import CAPTIONS, DIGITS, DigitsSettings, flat, real_digits
 from prefrl.protocols import pictures
+from prefrl.store import Store
 from prefrl.types import Picture
 
 PIXELS, WHICH = real_digits()
@@ -92,3 +94,15 @@ def test_a_reward_model_hangs_on_the_captions_and_not_on_the_start() -> None:
     assert one.identity() == one.shrunk().identity()
     assert one.identity() != DigitsSettings(captions=("a two",)).identity()
     assert flat(real("a three", 3)[:2]).shape == (2, 64)
+
+
+@pytest.mark.parametrize("labeler", ["labeler.kind=oracle", "labeler={kind: crowd, annotators: [{name: ann}]}"])
+def test_who_goes_by_gold_is_not_asked_about_what_has_none(labeler: str) -> None:
+    config = Config.load("pictures/digits", ["task.captions=[a three, mine]", labeler])
+    shrunk = config.model_copy(update={"task": config.task.shrunk()})
+    none = cast("Store[Picture]", None)
+    with pytest.raises(
+        ConfigError, match=r"goes by gold, and there is none for the captions mine: set labeler.kind=web"
+    ):
+        shrunk.build(none)
+    shrunk.model_copy(update={"loop": shrunk.loop.model_copy(update={"labels": 0})}).build(none)

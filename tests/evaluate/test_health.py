@@ -27,3 +27,9 @@ from prefrl.evaluate.health import warnings
 )
 def test_what_is_wrong_is_said(round: int, metrics: dict[str, float], warned: list[str]) -> None:
     assert list(warnings(round, metrics)) == warned
+
+
+def test_equal_rewards_are_said_in_words_that_fit_pictures_too() -> None:
+    said = warnings(1, {"improve/equal_groups": 1.0})["reward"]
+    assert "all candidates of each group" in said
+    assert "learner.responses" not in said

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 from small_pictures import small_digits
 
 from prefrl.components import ConfigError
@@ -36,6 +37,7 @@ class Server(ThreadingHTTPServer):
         self.reply: Callable[[dict[str, Any]], tuple[int, Any]] = says("A")
         self.asked: list[dict[str, Any]] = []
         self.keys: list[str | None] = []
+        self.drops: list[str] = []
 
     @property
     def address(self) -> str:
@@ -49,12 +51,20 @@ class Handler(BaseHTTPRequestHandler):
         question = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         self.server.asked.append(question)
         self.server.keys.append(self.headers["Authorization"])
+        if self.server.drops:
+            self.drop(self.server.drops.pop())
+            return
         status, said = self.server.reply(question) if self.path == "/v1/chat/completions" else (404, "not here")
         body = said.encode() if isinstance(said, str) else json.dumps(said).encode()
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
+
+    def drop(self, sent: str) -> None:
+        """Break off after some of the answer, or none."""
+        self.wfile.write(sent.encode())
+        self.close_connection = True
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Quietly."""
@@ -93,7 +103,7 @@ def task() -> Digits:
 
 
 def judge(task: Digits, server: Server, **changes: Any) -> VisionJudge:
-    return VisionJudgeSettings.model_validate({"address": server.address, **changes}).build(task)
+    return VisionJudgeSettings.model_validate({"address": server.address, "pause_seconds": 0, **changes}).build(task)
 
 
 def pairs(count: int, size: int = 2) -> list[Query[Picture]]:
@@ -171,6 +181,44 @@ def test_a_server_that_fails_once_is_asked_again(task: Digits, server: Server, t
     assert len(seen) == 3
 
 
+CHUNKED = "HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n40\r\n{"
+SHORT = "HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n{"
+
+
+@pytest.mark.parametrize("sent", ["", "no HTTP\r\n\r\n", SHORT, CHUNKED])
+def test_a_connection_that_breaks_is_tried_again_and_then_a_skip(
+    task: Digits, server: Server, tmp_path: Path, sent: str
+) -> None:
+    server.reply, server.drops = darker, [sent]
+    one = judge(task, server, at_once=1)
+    assert isinstance(answered(one, pairs(1), tmp_path / "once")[0], Comparison)
+    assert len(server.asked) == 3
+    server.drops = [sent] * 4
+    assert isinstance(answered(one, pairs(1), tmp_path / "always")[0], Skip)
+
+
+def test_pauses_grow(task: Digits, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    paused: list[float] = []
+    monkeypatch.setattr(time, "sleep", paused.append)
+    server.reply = lambda _: (429, "too many")
+    first, second = pairs(1)[0].candidates
+    (found,) = judge(task, server, at_once=1, retries=3, pause_seconds=0.5).compare([(first, second)])
+    assert np.isnan(found.preference)
+    assert [x for x in paused if x >= 0.5] == [0.5, 1.0, 2.0] * 2
+
+
+@pytest.mark.parametrize("answers", [("A", "A"), ("", "B"), ("A", "A "), ("A", " ")])
+def test_answers_that_cannot_be_told_apart_are_refused(answers: tuple[str, str]) -> None:
+    with pytest.raises(ValidationError, match="expected two answers that differ, neither empty"):
+        VisionJudgeSettings(answers=answers)
+
+
+def test_an_address_that_is_none_is_told(task: Digits) -> None:
+    first, second = pairs(1)[0].candidates
+    with pytest.raises(ConfigError, match=r"labeler.address: http://127.0.0.1:x/v1 is no address"):
+        VisionJudgeSettings(address="http://127.0.0.1:x/v1").build(task).compare([(first, second)])
+
+
 def test_a_server_that_cannot_be_used_is_told(task: Digits, server: Server, tmp_path: Path) -> None:
     first, second = pairs(1)[0].candidates
     server.reply = lambda _: (401, "no such key")
@@ -201,6 +249,37 @@ def test_what_a_reply_says() -> None:
     assert found[:2] == [1.0, 0.0]
     assert found[3] == 1.0
     assert all(np.isnan(x) for x in (found[2], *found[4:]))
+
+
+@pytest.mark.parametrize(
+    ("said", "value"),
+    [
+        (" A\n", 1.0),
+        ("(B)", 0.0),
+        ("Answer: B", 0.0),
+        ("**Answer:** A.", 1.0),
+        ("Picture B.", 0.0),
+        ("The answer is picture A", 1.0),
+        ("A three is clearer in B", None),
+        ("A/B", None),
+        ("A picture", None),
+        ("Answer:", None),
+        ("a", None),
+        ("Theanswer A", None),
+    ],
+)
+def test_only_an_answer_alone_or_after_a_lead_counts(said: str, value: float | None) -> None:
+    found = read_reply({"choices": [{"message": {"content": said}}]}, ("A", "B"))
+    assert np.isnan(found) if value is None else found == value
+
+
+def test_words_and_marks_may_be_answers_and_what_is_both_is_none() -> None:
+    def read(said: str, *answers: str) -> float:
+        return read_reply({"choices": [{"message": {"content": said}}]}, (answers[0], answers[1]))
+
+    assert read("Picture two.", "Picture one", "Picture two") == 0.0
+    assert read("+", "+", "-") == 1.0
+    assert np.isnan(read("-+", "+", "-"))
 
 
 def test_only_pictures_are_looked_at() -> None:

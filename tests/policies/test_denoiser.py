@@ -60,7 +60,7 @@ def test_a_step_is_a_gaussian_whose_probability_and_kl_are_exact(policy: Denoise
 @torch.no_grad()
 def test_the_mean_of_the_log_ratio_is_the_kl(policy: DenoiserPolicy) -> None:
     chains = policy.draw(["a three"] * 4000, np.random.default_rng(0))
-    ratios = (chains.logp - policy.start_logp(chains)).sum(1)
+    ratios = (chains.logp - policy.start_logp_and_kl(chains)[0]).sum(1)
     assert float(ratios.mean()) == pytest.approx(float(policy.kl(chains).sum(1).mean()), rel=0.03)
 
 
@@ -76,7 +76,7 @@ def test_a_chain_has_the_probability_that_it_was_drawn_with_to_the_bit(policy: D
 def test_a_fresh_policy_is_its_start_whatever_the_caption() -> None:
     one = policy_of(small_digits("a three", "an eight"))
     chains = drawn(one)
-    assert torch.equal(one.start_logp(chains), chains.logp)
+    assert torch.equal(one.start_logp_and_kl(chains)[0], chains.logp)
     assert float(one.kl(chains).max()) == 0.0
     first = one.draw(["a three"] * 4, np.random.default_rng(1))
     assert torch.equal(first.pixels, one.draw(["an eight"] * 4, np.random.default_rng(1)).pixels)
@@ -127,3 +127,22 @@ def test_the_noise_grows_from_none_to_all() -> None:
     assert float(signal[0]) == 1.0
     assert float(signal[-1]) == pytest.approx(1e-4)
     assert (signal.diff() < 0).all()
+
+
+@pytest.mark.parametrize("chunk", [1, 7])
+def test_a_smaller_chunk_draws_the_same_pictures(chunk: int) -> None:
+    task = small_digits("a three", "an eight")
+    whole, parts = (drawn(moved(policy_of(task, size))) for size in (64, chunk))
+    assert torch.equal(whole.states[:, 0], parts.states[:, 0])
+    torch.testing.assert_close(whole.states, parts.states, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(whole.logp, parts.logp, atol=1e-2, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_one_pass_of_the_start_gives_what_two_would(policy: DenoiserPolicy) -> None:
+    chains = drawn(policy)
+    logp, kl = policy.start_logp_and_kl(chains)
+    assert torch.equal(kl, policy.kl(chains))
+    assert torch.equal(kl, policy.log_prob_and_kl(chains)[1])
+    unmoved = policy_of(small_digits("a three", "an eight"))
+    assert torch.equal(logp, unmoved.log_prob(chains)[0])

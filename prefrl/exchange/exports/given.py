@@ -128,7 +128,7 @@ def refuse_segments(given: Given, form: str) -> None:
     """Raise `StoreError` where a form for texts would have to hold segments, or pictures."""
     kind = kind_of(given.query.candidates[0])
     forms = " or ".join(kind.exports)
-    error = StoreError(f"judgements of {kind.name} {kind.noun}s do not fit the form {form!r}; use --form {forms}")
+    error = StoreError(f"judgements of {kind.noun}s do not fit the form {form!r}; use --form {forms}")
     only(Response, given.query.candidates, error)
 
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from prefrl.components import ConfigError
 from prefrl.exchange.picture_rows import picture_pair
 from prefrl.exchange.ports import export, import_judgements
 from prefrl.judgements import Comparison, Ranking, Skip
+from prefrl.stages import config_of
 from prefrl.storage.log import StoreError
 from prefrl.store import Store
 from prefrl.types import Picture, Query, Response
@@ -64,7 +66,7 @@ def test_pictures_come_back_as_they_were(full: Store[Picture], tmp_path: Path) -
 
 def test_texts_do_not_fit_and_pictures_fit_no_form_for_texts(full: Store[Picture], tmp_path: Path) -> None:
     with pytest.raises(
-        StoreError, match="pictures pictures do not fit the form 'csv'; use --form bundle or pick-a-pic"
+        StoreError, match="judgements of pictures do not fit the form 'csv'; use --form bundle or pick-a-pic"
     ):
         export(full, tmp_path / "x.csv", "csv")
     with Store[Response](tmp_path / "texts") as store:
@@ -116,3 +118,13 @@ def test_rows_of_others_are_read() -> None:
 def test_rows_that_cannot_be_believed_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         picture_pair(row(**changes))
+
+
+def test_a_file_of_pictures_is_told_which_settings_fit(full: Store[Picture], tmp_path: Path) -> None:
+    export(full, tmp_path / "pairs.parquet", "pick-a-pic")
+    (tmp_path / "texts.jsonl").write_text('{"prompt": "p", "chosen": "a", "rejected": "b"}\n')
+    (tmp_path / "broken.parquet").write_bytes(b"none")
+    names = {"pairs.parquet": "pictures/digits", "texts.jsonl": "text/replies", "broken.parquet": "text/replies"}
+    for name, preset in names.items():
+        with pytest.raises(ConfigError, match=f"--config {preset} say"):
+            config_of(tmp_path / name, None)
