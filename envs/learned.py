@@ -177,6 +177,9 @@ class World:
         trusted = self.settings.tolerance * max(0.0, explained) / max(self.error, STILL)
         return int(min(self.settings.longest, trusted))
 
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return [*self._layers]
+
     def predict(self, observations: Tensor, actions: Tensor) -> Tensor:
         """(n, O) and (n, A), or (E, n, ...), each member's own -> (E, n, O + 1): what follows, differentiable; the last
         number is above one half where the episode is thought to terminate."""
