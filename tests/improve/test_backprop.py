@@ -66,7 +66,7 @@ def test_the_gradient_is_that_of_finite_differences(mean: bool, noisy: bool) -> 
 
     (weights,) = policy.parameters()
     with torch.no_grad():  # the starting actor does about the same everywhere
-        weights += 0.1 * torch.from_numpy(rng.standard_normal(weights.shape, np.float32))
+        weights.add_(torch.from_numpy(rng.standard_normal(weights.shape, np.float32)), alpha=0.1)
     (slope,) = torch.autograd.grad(worth(), weights)
     named = dict(zip(policy.named(), [*_split(policy, slope)], strict=True))
     assert not named["log_std"].any()
@@ -77,9 +77,9 @@ def test_the_gradient_is_that_of_finite_differences(mean: bool, noisy: bool) -> 
         both = []
         for step in (1e-3, -1e-3):
             with torch.no_grad():
-                weights += step * way
+                weights.add_(way, alpha=step)
                 both.append(float(worth()))
-                weights -= step * way
+                weights.sub_(way, alpha=step)
         assert (both[0] - both[1]) / 2e-3 == pytest.approx(float(slope @ way), rel=0.02)
 
 
