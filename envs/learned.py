@@ -192,11 +192,15 @@ class World:
         trusted = self.settings.tolerance * max(0.0, explained) / max(self.error, STILL)
         return int(min(self.settings.longest, trusted))
 
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return [*self._layers]
+
     def predict(self, observations: Tensor, actions: Tensor) -> Tensor:
         """(n, O) and (n, A), or (E, n, ...), each member's own -> (E, n, O + 1): what follows, differentiable; the last
         number is above one half where the episode is thought to terminate."""
         after, ends = self._foreseen(observations, actions)
-        return torch.cat([self._within(after), ends], -1)
+        # What was brought back has the gradient of what was not: else a policy would never learn to come back.
+        return torch.cat([after + (self._within(after) - after).detach(), ends], -1)
 
     @torch.no_grad()
     def imagine(self, observations: Floats, actions: Floats, members: Integers) -> Imagined:

@@ -109,6 +109,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "pictures": "prefrl.reward_models.pictures:PictureRewardSettings",
     },
     "learners": {
+        "backprop": "prefrl.improve.backprop:BackpropSettings",
         "clone": "prefrl.improve.clone:CloneSettings",
         "control": "prefrl.improve.control:ControlLearnerSettings",
         "cpl": "prefrl.improve.cpl:CPLSettings",

@@ -553,6 +553,19 @@ class StepRewardModel(RewardModel[Segment], StepRewards, Protocol):
     """A reward model for control: a segment's score is the sum of its steps' rewards."""
 
 
+@runtime_checkable
+class TracedRewards(Protocol):
+    """Rewards of steps that say how they change with what was seen and done."""
+
+    @property
+    def traceable(self) -> bool:
+        """Whether `traced` can be asked; not where features are made by hand, outside of torch."""
+
+    def traced(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """As `StepRewards.rewards`, (B, T, O) and (B, T, A) -> (B, T), each row an episode or a piece of one, on the
+        model's device: with gradients to both, whether the model's own weights take any or not."""
+
+
 class Inputs(Protocol):
     """What a policy reads of B sequences of at most L steps: tokens of responses, or decisions and what was seen."""
 
@@ -783,6 +796,7 @@ __all__ = [
     "Task",
     "TaskSettings",
     "TextTask",
+    "TracedRewards",
     "Transition",
     "Verdict",
 ]

@@ -7,12 +7,18 @@ standard deviations, where their uncertainty-weighted reward takes off the varia
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
 from prefrl.components import Settings
 from prefrl.types import Floats
+
+if TYPE_CHECKING:  # torch is heavy, and who reads settings needs none
+    from torch import Tensor
+
+LEAST = 1e-12
+"""The least variance that a gradient goes through: the root of zero has none."""
 
 
 class Ensemble(Settings):
@@ -35,10 +41,22 @@ def combine(values: Floats, settings: Ensemble, fits: int) -> Floats:
     count steps of the policy; here it is the fits that make the reward surer). One member has no spread.
     """
     found: Floats = values.min(0) if settings.by == "worst" else values.mean(0)
-    # max: before the first fit the bonus is as large as after it, and no larger.
-    beta = settings.optimism * (1 - settings.optimism_decay) ** max(fits - 1, 0)
-    spread = beta - (settings.caution if settings.by == "lower" else 0.0)
+    spread = _spread(settings, fits)
     return found + spread * values.std(0) if spread else found
 
 
-__all__ = ["Ensemble", "combine"]
+def combine_traced(values: Tensor, settings: Ensemble, fits: int) -> Tensor:
+    """As `combine`, in torch, with its gradient."""
+    found = values.amin(0) if settings.by == "worst" else values.mean(0)
+    spread = _spread(settings, fits)
+    return found + spread * values.var(0, correction=0).clamp(min=LEAST).sqrt() if spread else found
+
+
+def _spread(settings: Ensemble, fits: int) -> float:
+    """How many standard deviations over members are added."""
+    # max: before the first fit the bonus is as large as after it, and no larger.
+    beta = settings.optimism * (1 - settings.optimism_decay) ** max(fits - 1, 0)
+    return beta - (settings.caution if settings.by == "lower" else 0.0)
+
+
+__all__ = ["Ensemble", "combine", "combine_traced"]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from prefrl.components import ConfigError
 from prefrl.protocols import ControlTask
-from prefrl.reward_models.ensemble import Ensemble, combine
+from prefrl.reward_models.ensemble import Ensemble, combine, combine_traced
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats, Segment, State
 
@@ -216,6 +216,17 @@ class StepReward:
         steps = self._normalise_(self._inputs(observations, actions))  # in place on the copy that _inputs makes
         found = to_numpy(self._member_rewards(steps, marks.ravel()))
         return combine(found, self._ensemble, self._fits).reshape(shape)
+
+    @property
+    def traceable(self) -> bool:
+        return self._describe is None
+
+    def traced(self, observations: Tensor, actions: Tensor) -> Tensor:
+        both = torch.cat([observations, actions], -1)
+        begins = np.zeros(both.shape[:2], bool)
+        begins[:, 0] = True
+        found = self._member_rewards(((both - self._input_mean) / self._input_std).flatten(0, 1), begins.ravel())
+        return combine_traced(found, self._ensemble, self._fits).view(both.shape[:2])
 
     def features(self, candidates: Sequence[Segment]) -> Floats:
         """(N, 2 I): the mean and std of a segment's inputs over its steps, normalised as in the last fit.

@@ -16,16 +16,15 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from prefrl.components import Settings
-from prefrl.envs.imagined import Branches, Dream, DreamtTask
+from prefrl.envs.imagined import Dream, DreamtTask
 from prefrl.envs.learned import WorldSettings
 from prefrl.improve.control import ControlLearnerSettings
 from prefrl.improve.grounded import Grounded
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Actor, played
-from prefrl.policies.rollout import collect, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of
-from prefrl.types import Evaluation, Floats, Metrics, Segment, State, Steps
+from prefrl.types import Evaluation, Metrics, Segment, State, Steps
 
 OUTSIDE = ("evaluation_episodes", "device", "threads")
 """Settings of the learner inside that are said outside of it."""
@@ -152,7 +151,9 @@ class Dyna:
         metrics = dict(found.metrics)
         if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
-            metrics["imagined"] = float(self._imagined(starts, reward, rng).mean())
+            worth, spent = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
+            metrics["imagined"] = float(worth.mean())
+            self._checked += spent
         return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
     def pace(self, begin: float, end: float) -> None:
@@ -177,15 +178,6 @@ class Dyna:
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)
-
-    def _imagined(self, starts: Floats, reward: RewardModel[Segment], rng: np.random.Generator) -> Floats:
-        """(n,) learned returns of whole imagined episodes of the policy's mode."""
-        branches = Branches(replace(self._dream, starts=starts, lengths=[]), len(starts), self._task.horizon)
-        rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, played(self.actor(), None))
-        self._checked += rollout.ends.size
-        going = rollout.ends.cumsum(1) - rollout.ends == 0  # up to the first end, which counts
-        worth: Floats = np.where(going, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)
-        return worth
 
 
 __all__ = ["Dyna", "DynaSettings"]

@@ -6,12 +6,13 @@ import numpy as np
 import torch
 
 from prefrl.components import ConfigError
+from prefrl.envs.imagined import Branches, Dream
 from prefrl.envs.learned import Transitions, World, WorldSettings
 from prefrl.policies.divided import environments
-from prefrl.policies.rollout import Act, Rollout, whole_episodes
-from prefrl.protocols import ControlTask
+from prefrl.policies.rollout import Act, Rollout, collect, learned_rewards, step_rewards, whole_episodes
+from prefrl.protocols import ControlTask, RewardModel
 from prefrl.sample.segments import cut, first_rollout, placed, windows
-from prefrl.types import Metrics, Segment, State
+from prefrl.types import Floats, Metrics, Segment, State
 
 PLAYS = 4
 """So many rounds' real episodes are kept to be asked about."""
@@ -94,6 +95,16 @@ class Grounded:
         note = AWAKE.format(error=world.error, held_out=world.held_out) if world.fitted else UNTESTED
         self.fresh, self.notes = False, () if world.reach else (note,)
         return metrics
+
+    def imagined(
+        self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator
+    ) -> tuple[Floats, int]:
+        """Learned returns (n,) of whole imagined episodes from these starts (n, O), and how many steps they took."""
+        branches = Branches(Dream(self.world, starts), len(starts), self._task.horizon)
+        rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, act)
+        going = rollout.ends.cumsum(1) - rollout.ends == 0  # up to the first end, which counts
+        worth: Floats = np.where(going, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)
+        return worth, rollout.ends.size
 
     def state(self) -> State:
         data = None if self.data is None else self.data.state()

@@ -203,6 +203,25 @@ class MLPPolicy:
         """Nothing was drawn for them."""
         return examples
 
+    def traced(self, observations: Tensor, noise: Tensor | None = None) -> Tensor:
+        """(..., O) raw observations -> (..., A) continuous actions to execute, with gradients to weights and
+        observations; the mode, or what standard normal `noise` (..., A) makes of it. How noisy it is takes none."""
+        space = self.space
+        assert space.middle is not None
+        assert space.half is not None
+        assert space.clip is not None
+        middle, half, clip = (torch.from_numpy(x).to(self.device) for x in (space.middle, space.half, space.clip))
+        drawn = self._outputs("actor", self._normalised(observations))[1]
+        if noise is not None:
+            drawn = drawn + self.named()["log_std"].detach().exp() * noise
+        within = torch.where(clip.isfinite(), drawn.tanh(), drawn) if space.squash else drawn.clamp(-clip, clip)
+        return middle + half * within
+
+    def worth(self, observations: Tensor, learns: bool = False) -> Tensor:
+        """(..., O) raw observations -> (...) what the critic expects; `learns`: with gradients to its weights."""
+        named = self.named() if learns else {name: one.detach() for name, one in self.named().items()}
+        return self._outputs("critic", self._normalised(observations), named)[1].squeeze(-1)
+
     def values(self, inputs: Decisions) -> Tensor:
         """(B, 1)."""
         return self._outputs("critic", inputs.observations)[1]
@@ -277,9 +296,15 @@ class MLPPolicy:
     def _names(self, net: str) -> list[str]:
         return [name for name in self._shapes if name.startswith(net)]
 
-    def _outputs(self, net: str, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _normalised(self, observations: Tensor) -> Tensor:
+        """As `normalise`, with gradients."""
+        now = self.normaliser.now()
+        mean, scale = (torch.from_numpy(x).to(self.device) for x in (now.mean, now.scale))
+        return ((observations - mean) * scale).clamp(-now.clip, now.clip)
+
+    def _outputs(self, net: str, x: Tensor, named: dict[str, Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """(..., O) -> the last hidden layer (..., F) of the actor or the critic, and what it says (..., out)."""
-        parameters = self.named()
+        parameters = self.named() if named is None else named
         *hidden, last_weight, last_bias = (parameters[name] for name in self._names(net))
         for weight, bias in zip(hidden[::2], hidden[1::2], strict=True):
             x = activated(torch.nn.functional.linear(x, weight, bias), self.settings.activation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,10 +65,16 @@ class Watched:
 class Known:
     """A reward model that was told the reward: a function of observations and actions."""
 
-    function: Callable[[Floats, Floats], Floats] = field(default=lambda o, a: 1.0 - 2.0 * np.abs(o[..., 0]))
+    function: Callable[[Any, Any], Any] = field(default=lambda o, a: 1.0 - 2.0 * abs(o[..., 0]))
     members: int = 1
     fitted: bool = True
     memory: int = 1
+    traceable: bool = True
+
+    def traced(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Of functions that take tensors, as the default does."""
+        rewards: torch.Tensor = self.function(observations, actions)
+        return rewards
 
     def rewards(self, observations: Floats, actions: Floats, begins: np.ndarray | None = None) -> Floats:
         rewards: Floats = self.function(observations, actions).astype(np.float32)
