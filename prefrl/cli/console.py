@@ -163,9 +163,10 @@ def say(text: str, style: str = "") -> None:
 def round_line(round: Round) -> Text:
     """One round in one line: what matters most first."""
     m = round.metrics
+    gold = m.get("evaluate/gold", math.nan)
     parts = [
         Text(f"round {round.number:>3}", style="bold"),
-        *([] if math.isnan(m["evaluate/gold"]) else [Text(f"gold {m['evaluate/gold']:>9.3g}", style="blue")]),
+        *([] if math.isnan(gold) else [Text(f"gold {gold:>9.3g}", style="blue")]),
         Text(f"learned {m['evaluate/learned']:>8.3g}" if "evaluate/learned" in m else " " * 16, style="yellow"),
     ]
     for key, label, form in (

@@ -4,8 +4,8 @@ from io import StringIO
 
 from rich.console import Console
 
-from prefrl.cli.console import summary_table
-from prefrl.types import Json
+from prefrl.cli.console import round_line, summary_table
+from prefrl.types import Json, Round
 
 
 def shown(**more: object) -> str:
@@ -30,3 +30,8 @@ def test_what_was_measured_is_shown_before_and_after() -> None:
     assert "gold 0 → 0.5 (best 0.75)" in told
     assert "kl to the start, nats 0" in told
     assert "fluency 0.7 → 0.6" in told
+
+
+def test_a_round_without_a_gold_has_none_in_its_line() -> None:
+    assert "gold" not in round_line(Round(1, {"evaluate/learned": 1.0})).plain
+    assert "gold       0.5" in round_line(Round(1, {"evaluate/gold": 0.5})).plain
