@@ -46,7 +46,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "a2c": {"clip": None, "epochs": 1, "trace": 1.0, "rollout_steps": 16, "target_kl": None},
     "reinforce": {"clip": None, "epochs": 1, "trace": 1.0},
 }
-"""Where their defaults are others than those of the fields below."""
+"""Defaults that differ from the fields below."""
 ITS_OWN = {"hidden", "initial_std", "squash", "sde", "sde_steps"}
 """Settings of a policy that starts from another one, and that may be the other's."""
 MOVED = ("hidden", "initial_std")

@@ -37,7 +37,7 @@ ALGORITHMS: dict[str, dict[str, object]] = {
     "mppi": {"iterations": 1, "candidates": 500},
     "mcts": {"plan": 80, "discount": 0.95, "episodes": 16},
 }
-"""Where their defaults are others than those of the fields below."""
+"""Defaults that differ from the fields below."""
 DRAWS = ("world", "candidates", "iterations", "std")
 OWN: dict[str, tuple[str, ...]] = {
     "cem": (*DRAWS, "elites"),

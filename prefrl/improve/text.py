@@ -58,7 +58,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "ppo": {"advantage": "gae", "clip": 0.2, "reduction": "token", "prompts": 128, "responses": 1, "epochs": 4}
     | {"whiten": True},
 }
-"""Where their defaults are others than those of the fields below."""
+"""Defaults that differ from the fields below."""
 RATIO_TOLERANCE = {torch.float32: 0.01, torch.bfloat16: 1.0, torch.float16: 0.3}
 """In half precision a decoding step rounds otherwise than a pass over all tokens."""
 
