@@ -369,19 +369,36 @@ def _dry_run(config: Config, seeds: int) -> None:
     say(f"what it would cost outside a simulator. {account(costs(spent))}")
 
 
+MISTAKES = (ValueError, FloatingPointError, MemoryError, ModuleNotFoundError, OSError)
+"""What a user can do something about."""
+
+
 def main() -> None:
     """Turn a user's mistake into one line on stderr and exit status 2; PREFRL_DEBUG=1 shows where it came from."""
     try:
         app()
     except KeyboardInterrupt:
         sys.exit(130)
-    except (ValueError, FloatingPointError, MemoryError, ModuleNotFoundError, OSError) as error:
-        if os.environ.get("PREFRL_DEBUG"):
+    except Exception as error:
+        if _interrupted(error):
+            sys.exit(130)
+        if not isinstance(error, MISTAKES) or os.environ.get("PREFRL_DEBUG"):
             raise
-        from prefrl.cli.console import errors
-        from prefrl.components import missing
-
-        text = missing(error) if isinstance(error, ModuleNotFoundError) else str(error)
-        for line in text.splitlines():
-            errors.print(f"error: {line}", style="red", markup=False, soft_wrap=True)
+        _tell(error)
         sys.exit(2)
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C began it: a library that is interrupted while it tidies up fails with an error of its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
+
+
+def _tell(mistake: Exception) -> None:
+    from prefrl.cli.console import errors
+    from prefrl.components import missing
+
+    text = missing(mistake) if isinstance(mistake, ModuleNotFoundError) else str(mistake)
+    for line in text.splitlines():
+        errors.print(f"error: {line}", style="red", markup=False, soft_wrap=True)

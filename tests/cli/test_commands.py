@@ -18,6 +18,7 @@ from text_models import classifier, gpt2
 
 from prefrl import Config
 from prefrl.cli.console import interrupts
+from prefrl.cli.main import main
 from prefrl.components import TABLE, kinds, plugins
 from prefrl.envs.text import Reviews
 from prefrl.improve.control import ControlLearnerSettings
@@ -303,6 +304,26 @@ def test_a_ctrl_c_that_is_ignored_stays_ignored() -> None:
     except KeyboardInterrupt:  # by itself it would end all the tests
         pytest.fail("it was heard")
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_ctrl_c_is_ctrl_c_where_a_library_fails_over_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise AssertionError("not tidied up")
+
+    monkeypatch.setattr("prefrl.cli.main.app", interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 130
+
+    def broken() -> None:
+        raise AssertionError("our own")
+
+    monkeypatch.setattr("prefrl.cli.main.app", broken)
+    with pytest.raises(AssertionError, match="our own"):
+        main()
 
 
 def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
