@@ -9,8 +9,7 @@ from markupsafe import Markup
 from prefrl.evaluate.card import Bucket, ReportCard
 from prefrl.report import card_words, plots
 from prefrl.report.card_words import Row
-from prefrl.report.chapters import Card
-from prefrl.report.plots import Bar, Line
+from prefrl.report.plots import Bar, Card, Line
 from prefrl.report.words import show_number, show_share
 from prefrl.stats.estimates import Estimate
 

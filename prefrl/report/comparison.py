@@ -14,9 +14,8 @@ import numpy as np
 from markupsafe import Markup
 
 from prefrl.report import plots
-from prefrl.report.chapters import Card
 from prefrl.report.groups import Contest, Group, Seen, contests, ended, found_in, left_out
-from prefrl.report.plots import Line, Strip
+from prefrl.report.plots import Card, Line, Strip
 from prefrl.report.report import page
 from prefrl.report.words import show_count, show_number, show_share, show_time
 from prefrl.stats import aggregates

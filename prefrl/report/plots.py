@@ -53,6 +53,16 @@ STYLE: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
+class Card:
+    """A figure with how to read it."""
+
+    title: str
+    figure: Markup
+    """Empty while there is nothing to draw."""
+    reading: str
+
+
+@dataclass(frozen=True)
 class Line:
     """One curve over the rounds."""
 
@@ -77,6 +87,11 @@ class Bar:
     count: int
     beside: float | None = None
     """Another share of the same comparisons, drawn as a diamond."""
+
+
+def known(values: Series) -> bool:
+    """Whether there is anything to draw."""
+    return any(value is not None for value in values)
 
 
 def lines(
