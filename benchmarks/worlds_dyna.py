@@ -16,7 +16,7 @@ import json
 import statistics
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,17 @@ EPISODES = 20
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="control/pendulum-dyna")
-    parser.add_argument("--seeds", type=int, default=10)
+    options, runs = over_seeds(__doc__, "control/pendulum-dyna", 10, one_run)
+    print(json.dumps(said(options.preset, runs) | {"first": options.first, "short": options.short}))
+
+
+def over_seeds(
+    about: str | None, preset: str, seeds: int, one_run: Callable[[str, int, Sequence[str]], dict[str, Any]]
+) -> tuple[argparse.Namespace, list[dict[str, Any]]]:
+    """The options, and what each seed came to: a line for each as it ends."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default=preset)
+    parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--short", action="store_true", help="one seed")
     parser.add_argument("--settings", nargs="*", default=[], help="settings beside the preset's")
@@ -35,7 +43,7 @@ def main() -> None:
     for seed in range(options.first, options.first + (1 if options.short else options.seeds)):
         runs.append(one_run(options.preset, seed, options.settings))
         print(f"seed {seed}: {runs[-1]}", flush=True)
-    print(json.dumps(said(options.preset, runs) | {"first": options.first, "short": options.short}))
+    return options, runs
 
 
 def one_run(preset: str, seed: int, settings: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,6 @@ and `regret`, as a share of the span of true returns. The last line is one JSON 
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import tempfile
@@ -23,22 +22,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from worlds_dyna import over_seeds
 
 EPISODES = 20
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="control/pendulum-planner")
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first", type=int, default=100)
-    parser.add_argument("--short", action="store_true", help="one seed")
-    parser.add_argument("--settings", nargs="*", default=[], help="settings beside the preset's")
-    options = parser.parse_args()
-    runs = []
-    for seed in range(options.first, options.first + (1 if options.short else options.seeds)):
-        runs.append(one_run(options.preset, seed, options.settings))
-        print(f"seed {seed}: {runs[-1]}", flush=True)
+    options, runs = over_seeds(__doc__, "control/pendulum-planner", 5, one_run)
     print(json.dumps(said(options.preset, options.settings, runs) | {"first": options.first, "short": options.short}))
 
 
