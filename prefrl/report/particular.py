@@ -133,7 +133,7 @@ def judging(record: Record) -> tuple[Card, ...]:
             f"one that always says the first.{told} Its answers are means over both orders.",
         ),
         Card(
-            "Without a verdict",
+            "Changed with the order, or refused",
             plots.lines("verdicts", record.numbers, curves, zero=True),
             "The shares of pairs whose winner changes with the order, and of those that the judge refused, which are "
             "skipped.",
