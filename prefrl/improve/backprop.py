@@ -119,7 +119,7 @@ class Backprop:
 
     @property
     def steps(self) -> Steps:
-        return self._player.steps.add(learn=self.ground.spent, imagined=self._imagined)
+        return self._player.steps.add(learn=self.ground.spent, imagined=self._imagined + self.ground.dreamt)
 
     def check_reward(self, reward: RewardModel[Any]) -> None:
         traced_rewards(reward)
@@ -160,9 +160,8 @@ class Backprop:
         metrics = dict(found.metrics)
         if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
-            worth, spent = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
+            worth = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
             metrics["imagined"] = float(worth.mean())
-            self._imagined += spent
         return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
     def pace(self, begin: float, end: float) -> None:

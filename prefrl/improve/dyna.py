@@ -109,12 +109,10 @@ class Dyna:
         inside = settings.inside.model_copy(update={"device": settings.device})
         self._inside = inside.build(DreamtTask(task, self._dream), rng)
         self._player = Player(task, settings.inside.environments)
-        self._checked = 0
-        """Steps that were imagined to be held against real ones."""
 
     @property
     def steps(self) -> Steps:
-        return self._player.steps.add(learn=self.ground.spent, imagined=self._inside.steps.learn + self._checked)
+        return self._player.steps.add(learn=self.ground.spent, imagined=self._inside.steps.learn + self.ground.dreamt)
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of real episodes of the policy as it is; the world learns from these as well.
@@ -151,9 +149,8 @@ class Dyna:
         metrics = dict(found.metrics)
         if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
-            worth, spent = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
+            worth = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
             metrics["imagined"] = float(worth.mean())
-            self._checked += spent
         return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
     def pace(self, begin: float, end: float) -> None:
@@ -167,14 +164,12 @@ class Dyna:
         self._inside.save(path)
 
     def state(self) -> State:
-        parts = {"ground": self.ground.state(), "inside": self._inside.state(), "player": self._player.state()}
-        return parts | {"checked": self._checked}
+        return {"ground": self.ground.state(), "inside": self._inside.state(), "player": self._player.state()}
 
     def load(self, state: State) -> None:
         self.ground.load(state["ground"])
         self._inside.load(state["inside"])
         self._player.load(state["player"])
-        self._checked = state["checked"]
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)

@@ -43,7 +43,7 @@ def all_legal(task: ControlTask) -> None:
 
 
 class Grounded:
-    """A world, and the real steps that it is learned from. `spent` counts them."""
+    """A world, and the real steps that it is learned from. `spent` counts them, and `dreamt` what it imagines here."""
 
     def __init__(
         self, settings: WorldSettings, task: ControlTask, device: torch.device, rng: np.random.Generator
@@ -55,7 +55,7 @@ class Grounded:
         self.data: Transitions | None = None
         self.fresh = False
         """Whether the newest real episodes were not learned from yet."""
-        self.spent = 0
+        self.spent, self.dreamt = 0, 0
         self.notes: tuple[str, ...] = ()
         """What people should know of the last fit."""
         self._plays: list[Rollout] = []
@@ -98,23 +98,25 @@ class Grounded:
 
     def imagined(
         self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator
-    ) -> tuple[Floats, int]:
-        """Learned returns (n,) of whole imagined episodes from these starts (n, O), and how many steps they took."""
+    ) -> Floats:
+        """Learned returns (n,) of whole imagined episodes from these starts (n, O)."""
         branches = Branches(Dream(self.world, starts), len(starts), self._task.horizon)
         rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, act)
         going = rollout.ends.cumsum(1) - rollout.ends == 0  # up to the first end, which counts
         worth: Floats = np.where(going, learned_rewards(step_rewards(reward), rollout), 0.0).sum(1)
-        return worth, rollout.ends.size
+        self.dreamt += rollout.ends.size
+        return worth
 
     def state(self) -> State:
         data = None if self.data is None else self.data.state()
-        counted = {"fresh": self.fresh, "spent": self.spent, "played": self._played, "notes": list(self.notes)}
-        return counted | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
+        counted = {"spent": self.spent, "dreamt": self.dreamt, "played": self._played}
+        told = {"fresh": self.fresh, "notes": list(self.notes)}
+        return counted | told | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
 
     def load(self, state: State) -> None:
         self.data = None if state["data"] is None else Transitions(**state["data"])
-        self.fresh, self.spent, self._played = state["fresh"], state["spent"], state["played"]
-        self.notes = tuple(state["notes"])
+        self.spent, self.dreamt, self._played = state["spent"], state["dreamt"], state["played"]
+        self.fresh, self.notes = state["fresh"], tuple(state["notes"])
         self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
 
