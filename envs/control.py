@@ -17,6 +17,7 @@ from pydantic import Field
 from prefrl.components import ConfigError, Settings, missing, suggest
 from prefrl.envs.fast.bodies import BODIES
 from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
+from prefrl.envs.fast.retold import Retell, retelling
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.fast.wrapped import AfterEnd, Wrapped, is_mujoco, make
 from prefrl.envs.partial import Partial
@@ -110,7 +111,9 @@ class ControlSettings(Settings):
         action, size = env.action_space, math.prod(env.observation_space.shape or ())
         after: AfterEnd = "end" if self.variable_horizon else self.after_end
         environments = self._stepper(name, plain, horizon, after)
+        retell = retelling(WORLDS[name](after == "end")) if name in WORLDS else None
         if self.hide or self.flicker or self.stack > 1:
+            retell = None
             environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)
         # Blindness is drawn for all at once.
         parted = not self.flicker and _can_be_parted(name, after)
@@ -128,6 +131,7 @@ class ControlSettings(Settings):
             frame_size=self.frame_size,
             make=environments,
             part=environments if parted else None,
+            retell=retell,
             notes=notes,
             options=self.options,
         )
@@ -236,6 +240,7 @@ class GymnasiumTask:
     make: Callable[[int], Environments]
     part: Callable[..., Environments] | None = None
     """As `make`, but for those in `mine`."""
+    retell: Retell | None = None
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     """The environment's keyword arguments, for drawing."""

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from prefrl.components import ConfigError, Settings
+from prefrl.envs.fast.retold import Retell, retelling
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.protocols import Dynamics, Environments
 from prefrl.types import Bools, Floats, Segment
@@ -40,6 +41,9 @@ class Point:
 
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
+
+    def recognise(self, observations: Floats) -> Floats:
+        return observations.astype(np.float64)
 
     def legal(self, states: Floats) -> Bools | None:
         return None
@@ -227,6 +231,10 @@ class ToyTask:
             raise ConfigError(
                 f"task: a segment of {self.segment_steps} steps is longer than an episode of {self.horizon}"
             )
+
+    @property
+    def retell(self) -> Retell | None:
+        return retelling(self.world)
 
     def environments(self, count: int) -> Environments:
         return Vectorised(self.world, count, self.horizon)

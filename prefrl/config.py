@@ -20,6 +20,7 @@ from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
     GoesByGold,
+    Imagines,
     Imitates,
     Labeler,
     LabelerSettings,
@@ -28,6 +29,7 @@ from prefrl.protocols import (
     NeedsShowing,
     Particular,
     PartlyGraded,
+    Retells,
     RewardModel,
     RewardSettings,
     SelectorSettings,
@@ -148,7 +150,7 @@ class Config(Settings):
     def build(self, store: Store) -> Loop:
         """Make every component, and the loop that joins them, on an open store."""
         from prefrl.fit.descent import trainable  # torch is heavy, and who reads settings needs none
-        from prefrl.sample.select import UnscoredSettings  # and so is scipy
+        from prefrl.sample.select import PoolSettings, UnscoredSettings  # and so is scipy
 
         rng, select = streams(self.seed, 0).build, cast(SelectorSettings, self.select)
         task = self.build_task()
@@ -167,6 +169,9 @@ class Config(Settings):
                 f"select.best_of={select.best_of} chooses among so many candidates for each query, and loop.pool "
                 f"samples {self.loop.pool:g}: set loop.pool={select.best_of}"
             )
+        imagined = isinstance(select, PoolSettings) and select.imagined
+        if imagined:
+            self._check_imagined(learner, task)
         if isinstance(learner, Particular):
             learner.check_reward(reward)
         if self.loop.labels and reward.fitted and not trainable(reward):
@@ -182,6 +187,7 @@ class Config(Settings):
             fitting=self.fitting,
             settings=self.loop,
             seed=self.seed,
+            imagined=imagined,
             threads=self.learner.threads if isinstance(self.learner, Threaded) else None,
         )
 
@@ -215,6 +221,20 @@ class Config(Settings):
             raise ConfigError(
                 f"labeler.kind={self.labeler.model_dump()['kind']} goes by gold, and there is none for the captions "
                 f"{', '.join(task.ungraded)}: set labeler.kind=web to judge yourself, or ask for other captions"
+            )
+
+    def _check_imagined(self, learner: Learner, task: Task) -> None:
+        """Raises `ConfigError` where nothing can be imagined, or nobody could judge it."""
+        if not isinstance(learner, Imagines):
+            raise ConfigError(
+                f"select.imagined: learner.kind={self.learner.model_dump()['kind']} has no policy in a learned world, "
+                "whose behaviour could be asked about: set learner.kind=dyna or learner.kind=backprop, or leave it out"
+            )
+        if not isinstance(task, Retells) or task.retell is None:
+            raise ConfigError(
+                f"select.imagined: what is imagined of {task.name} can neither be drawn nor judged, since its "
+                "simulator's states cannot be told from what is seen. Those of classic control can, as long as nothing "
+                "is hidden: Pendulum-v1, CartPole-v1, Acrobot-v1, MountainCar-v0, MountainCarContinuous-v0"
             )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

@@ -17,7 +17,19 @@ from pydantic import Field
 from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
-from prefrl.protocols import Examined, Imitates, Labeler, Learner, Paced, RewardModel, Selector, Settles, Store, Task
+from prefrl.protocols import (
+    Examined,
+    Imagines,
+    Imitates,
+    Labeler,
+    Learner,
+    Paced,
+    RewardModel,
+    Selector,
+    Settles,
+    Store,
+    Task,
+)
 from prefrl.seeding import Streams, streams, threads
 from prefrl.types import C, Evaluation, Fitted, Metrics, Query, Round
 
@@ -74,6 +86,8 @@ class Loop(Generic[C]):
     fitting: FittingSettings
     settings: LoopSettings
     seed: int = 0
+    imagined: bool = False
+    """Whether queries are about what the policy would do, in the learner's world."""
     threads: int | None = None
     """With how many threads torch and BLAS compute; None leaves that to them."""
     fit: Fit[C] | None = None
@@ -130,7 +144,10 @@ class Loop(Generic[C]):
         if count <= 0:
             return []
         with self._timed("sample"):
-            pool = self.learner.sample(int(count * self.candidates * self.settings.pool), rng.sample)
+            sample = (
+                self.learner.imagine if self.imagined and isinstance(self.learner, Imagines) else self.learner.sample
+            )
+            pool = sample(int(count * self.candidates * self.settings.pool), rng.sample)
             queries = self.selector.select(pool, self.reward, count, rng.select)
             if not queries:
                 raise ValueError(

@@ -125,6 +125,14 @@ class Dynamics(Protocol):
         """(size, size, 3) uint8 of a state (S,), or None where there is nothing to see."""
 
 
+@runtime_checkable
+class Recognised(Dynamics, Protocol):
+    """A world whose states can be told from what is seen."""
+
+    def recognise(self, observations: Floats) -> Floats:
+        """(n, O) -> (n, S) float64: states that look like these, whether or not an episode could come there."""
+
+
 class Environments(Protocol):
     """n environments stepped together. An episode that ends is reset in the same step."""
 
@@ -216,6 +224,16 @@ class Mapped(ControlTask, Protocol):
 
     def legal(self, observations: Floats) -> Bools:
         """(n, O) -> (n, A): which actions there were."""
+
+
+@runtime_checkable
+class Retells(ControlTask, Protocol):
+    """A control task that may know what would be true of steps that were only imagined."""
+
+    @property
+    def retell(self) -> Callable[[Floats, Floats], tuple[Floats, Floats]] | None:
+        """Observations (n, O) and actions (n, A) -> simulator states (n, S) that look like that, and the gold (n,) of
+        these actions in them: for people's eyes, and for oracles. None where what is seen does not tell the state."""
 
 
 @runtime_checkable
@@ -724,6 +742,14 @@ class Learner(Protocol[C]):
     def state(self) -> State: ...
 
     def load(self, state: State) -> None: ...
+
+
+@runtime_checkable
+class Imagines(Protocol[C]):
+    """A learner that can foresee what its policy would do."""
+
+    def imagine(self, count: int, rng: np.random.Generator) -> list[C]:
+        """As many candidates as `Learner.sample` is asked for, of behaviour that never happened."""
 
 
 @runtime_checkable

@@ -33,6 +33,10 @@ class Pendulum:
         angle, velocity = states.T
         return _beside(np.cos(angle), np.sin(angle), velocity).astype(np.float32)
 
+    def recognise(self, observations: Floats) -> Floats:
+        cos, sin, velocity = observations.T
+        return _beside(np.arctan2(sin, cos), velocity)
+
     def legal(self, states: Floats) -> Bools | None:
         return None
 
@@ -73,6 +77,9 @@ class CartPole:
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
 
+    def recognise(self, observations: Floats) -> Floats:
+        return observations.astype(np.float64)
+
     def legal(self, states: Floats) -> Bools | None:
         return None
 
@@ -110,6 +117,10 @@ class Acrobot:
         """A first observation is gymnasium's to rounding only: it computes that one in float32."""
         first, second, *spins = states.T
         return _beside(np.cos(first), np.sin(first), np.cos(second), np.sin(second), *spins).astype(np.float32)
+
+    def recognise(self, observations: Floats) -> Floats:
+        cos, sin, second_cos, second_sin, *spins = observations.T
+        return _beside(np.arctan2(sin, cos), np.arctan2(second_sin, second_cos), *spins)
 
     def legal(self, states: Floats) -> Bools | None:
         return None
@@ -184,6 +195,9 @@ class MountainCar:
 
     def observe(self, states: Floats) -> Floats:
         return states.astype(np.float32)
+
+    def recognise(self, observations: Floats) -> Floats:
+        return observations.astype(np.float64)
 
     def legal(self, states: Floats) -> Bools | None:
         return None

@@ -127,10 +127,16 @@ class Backprop:
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of real episodes of the policy as it is; the world learns from these as well."""
         if not self.ground.begun:
-            self.ground.begin(count, played(self.actor(), rng), 64, rng)
+            self._begin(count, rng)
         elif not self.ground.fresh:
             self._play(rng)
         return self.ground.segments(count, rng)
+
+    def imagine(self, count: int, rng: np.random.Generator) -> list[Segment]:
+        """Segments of imagined branches of the policy as it is; first real episodes, where there are none yet."""
+        if not self.ground.begun:
+            self._begin(count, rng)
+        return self.ground.imagine(count, played(self.actor(), rng), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then take `updates` gradient steps through it.
@@ -192,6 +198,9 @@ class Backprop:
         self._player.load(state["player"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._imagined = state["imagined"]
+
+    def _begin(self, count: int, rng: np.random.Generator) -> None:
+        self.ground.begin(count, played(self.actor(), rng), 64, rng)
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)

@@ -121,10 +121,16 @@ class Dyna:
         are none of that either.
         """
         if not self.ground.begun:
-            self.ground.begin(count, played(self.actor(), rng), self._settings.inside.environments, rng)
+            self._begin(count, rng)
         elif not self.ground.fresh:
             self._play(rng)
         return self.ground.segments(count, rng)
+
+    def imagine(self, count: int, rng: np.random.Generator) -> list[Segment]:
+        """Segments of imagined branches of the policy as it is; first real episodes, where there are none yet."""
+        if not self.ground.begun:
+            self._begin(count, rng)
+        return self.ground.imagine(count, played(self.actor(), rng), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then let the policy learn in it.
@@ -170,6 +176,9 @@ class Dyna:
         self.ground.load(state["ground"])
         self._inside.load(state["inside"])
         self._player.load(state["player"])
+
+    def _begin(self, count: int, rng: np.random.Generator) -> None:
+        self.ground.begin(count, played(self.actor(), rng), self._settings.inside.environments, rng)
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)

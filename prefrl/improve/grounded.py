@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -10,7 +12,7 @@ from prefrl.envs.imagined import Branches, Dream
 from prefrl.envs.learned import Transitions, World, WorldSettings
 from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, collect, learned_rewards, step_rewards, whole_episodes
-from prefrl.protocols import ControlTask, RewardModel
+from prefrl.protocols import ControlTask, Retells, RewardModel
 from prefrl.sample.segments import cut, first_rollout, placed, windows
 from prefrl.types import Floats, Metrics, Segment, State
 
@@ -22,6 +24,12 @@ AWAKE = (
     "dreaming, and its policy stays as it is until the world is better: raise learner.episodes, so that it sees more, "
     "or learner.world.tolerance"
 )
+REAL = (
+    "{real} of {count} segments to ask about are real ones: the learned world cannot be followed for the {steps} steps "
+    "of a segment, or not often enough; make task.segment_seconds (or segment_steps) smaller, or raise learner.episodes"
+)
+PASSES = 4
+"""So often branches are imagined for segments to ask about, in place of those that were cut short."""
 UNTESTED = (
     "the learned world cannot be trusted: no held-out step says how good it is, since too little has moved in the real "
     "episodes so far, or since its fit has diverged; the run has stopped dreaming, and its policy stays as it is until "
@@ -56,8 +64,7 @@ class Grounded:
         self.fresh = False
         """Whether the newest real episodes were not learned from yet."""
         self.spent, self.dreamt = 0, 0
-        self.notes: tuple[str, ...] = ()
-        """What people should know of the last fit."""
+        self._notes: dict[str, str] = {}
         self._plays: list[Rollout] = []
         """The newest real episodes, oldest first."""
         self._played = 0
@@ -66,6 +73,11 @@ class Grounded:
     def begun(self) -> bool:
         """Whether anything was played."""
         return self._played > 0
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What people should know of the last fit, and of the last segments that were imagined."""
+        return tuple(self._notes.values())
 
     def begin(self, count: int, act: Act, most: int, rng: np.random.Generator) -> None:
         """Play as many episodes, of at most `most` environments, as hold so many segments."""
@@ -93,12 +105,34 @@ class Grounded:
         assert self.data is not None
         metrics, world = self.world.fit(self.data, rng), self.world
         note = AWAKE.format(error=world.error, held_out=world.held_out) if world.fitted else UNTESTED
-        self.fresh, self.notes = False, () if world.reach else (note,)
+        self.fresh = False
+        self._note("world", "" if world.reach else note)
         return metrics
 
-    def imagined(
-        self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator
-    ) -> Floats:
+    def imagine(self, count: int, act: Act, rng: np.random.Generator) -> list[Segment]:
+        """Segments of as many imagined branches from real states, with the states that they look like and their gold.
+
+        Each is whole: none was cut where members part. Where too few are, real ones (`segments`) stand in, and a note
+        says so.
+        """
+        if self.fresh:
+            self.learn(rng)
+        assert self.data is not None
+        assert isinstance(self._task, Retells)
+        length, found = self._task.segment_steps, list[Segment]()
+        for number in range(PASSES if self.world.reach >= length else 0):
+            branches = Branches(Dream(self.world, self.data.starts), count - len(found))
+            rollout, _ = collect(branches, branches.reset(rng), length, act)
+            self.dreamt += rollout.ends.size
+            whole = len(windows(rollout, length)[0])
+            found += cut(rollout, length, whole, f"imagined after play {self._played}, {number}", rng)
+            if len(found) == count:
+                break
+        real, numbers = count - len(found), {"count": count, "steps": length}
+        self._note("asked", REAL.format(real=real, **numbers) if real else "")
+        return [_retold(self._task, one) for one in found] + (self.segments(real, rng) if real else [])
+
+    def imagined(self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator) -> Floats:
         """Learned returns (n,) of whole imagined episodes from these starts (n, O)."""
         branches = Branches(Dream(self.world, starts), len(starts), self._task.horizon)
         rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, act)
@@ -110,21 +144,32 @@ class Grounded:
     def state(self) -> State:
         data = None if self.data is None else self.data.state()
         counted = {"spent": self.spent, "dreamt": self.dreamt, "played": self._played}
-        told = {"fresh": self.fresh, "notes": list(self.notes)}
-        return counted | told | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
+        told = {"fresh": self.fresh, "notes": dict(self._notes)}
+        return (
+            counted | told | {"data": data, "plays": [one.state() for one in self._plays], "world": self.world.state()}
+        )
 
     def load(self, state: State) -> None:
         self.data = None if state["data"] is None else Transitions(**state["data"])
         self.spent, self.dreamt, self._played = state["spent"], state["dreamt"], state["played"]
-        self.fresh, self.notes = state["fresh"], tuple(state["notes"])
+        self.fresh, self._notes = state["fresh"], dict(state["notes"])
         self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
+
+    def _note(self, of: str, text: str) -> None:
+        self._notes = {name: told for name, told in self._notes.items() if name != of} | ({of: text} if text else {})
 
     def _keep(self, rollout: Rollout, rng: np.random.Generator) -> None:
         new = Transitions.of(rollout, self.world.settings.held_out, rng, self.data)
         self.data = new if self.data is None else self.data.joined(new)
         self.fresh, self.spent = True, self.spent + rollout.ends.size
         self._plays, self._played = [*self._plays, rollout][-PLAYS:], self._played + 1
+
+
+def _retold(task: Retells, one: Segment) -> Segment:
+    assert task.retell is not None
+    states, gold = task.retell(one.observations, one.actions)
+    return replace(one, states=states, gold=gold)
 
 
 __all__ = ["Grounded", "all_legal"]

@@ -22,15 +22,23 @@ from prefrl.sample.queries import asked, disjoint, groups, newest, proposals, qu
 from prefrl.types import C, Floats, Integers, Query
 
 
-class UnscoredSettings(Settings):
+class PoolSettings(Settings):
+    """What may be asked about."""
+
+    newest: float = Field(1.0, gt=0, le=1)
+    """The share of the pool, from its end where the newest are, that may be asked about."""
+    imagined: bool = False
+    """Ask about what the policy would do, in the learner's world, and not about what it did: behaviour that would be
+    dear or dangerous never has to happen (Reddy et al. 2020). For learners with a learned world."""
+
+
+class UnscoredSettings(PoolSettings):
     """Ask without a look at what the reward model predicts; both kinds work before the first fit."""
 
     kind: Literal["uniform", "coverage"] = "uniform"
     """At random, or about queries that are far from one another (greedy k-center)."""
     candidates: int = Field(2, ge=1, le=8)
     """K: how many candidates a query puts side by side; 1 for an expert, who shows what to do instead."""
-    newest: float = Field(1.0, gt=0, le=1)
-    """The share of the pool, from its end where the newest are, that may be asked about."""
     best_of: int = Field(1, ge=1)
     """With one candidate, that of so many which the newest reward scores highest (to one prompt, for texts): people are
     then shown the better answer, to make it better still. Before the first fit it is any of them. `loop.pool` has to be
@@ -83,7 +91,7 @@ class Coverage(Generic[C]):
         return asked(pool, queries)
 
 
-class ScoredSettings(Settings):
+class ScoredSettings(PoolSettings):
     """Ask where the answer is worth most to an ensemble: information is BALD's (Houlsby et al. 2011)."""
 
     kind: Literal["disagreement", "entropy", "information"] = "disagreement"
@@ -91,8 +99,6 @@ class ScoredSettings(Settings):
     which member is right."""
     candidates: int = Field(2, ge=2, le=8)
     """K: how many candidates a query puts side by side."""
-    newest: float = Field(1.0, gt=0, le=1)
-    """The share of the pool, from its end where the newest are, that may be asked about."""
     proposals: int = Field(8, ge=1)
     """In how many possible queries, about, each candidate is tried; at most one of them is asked."""
     diversify: Literal["none", "k_medoids", "dpp", "batch"] = "none"

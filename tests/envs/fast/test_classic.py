@@ -8,6 +8,7 @@ import pytest
 
 from prefrl.envs.control import WORLDS
 from prefrl.envs.fast.classic import Acrobot, CartPole, MountainCar, MountainCarContinuous, Pendulum
+from prefrl.envs.fast.retold import retelling
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.protocols import Dynamics
 
@@ -166,3 +167,21 @@ def test_same_seed_gives_equal_bytes() -> None:
         return first.tobytes() + b"".join(envs.step(left).observations.tobytes() for _ in range(12))
 
     assert run() == run()
+
+
+@pytest.mark.parametrize("name", sorted(WORLDS))
+def test_states_are_told_from_what_is_seen_and_what_is_imagined_is_judged_as_gymnasium_would(name: str) -> None:
+    rng, world = np.random.default_rng(3), WORLDS[name](False)
+    discrete = not name.startswith(("Pendulum", "MountainCarContinuous"))
+    envs, retell = Vectorised(world, 8, 1000), retelling(world)
+    assert retell is not None
+    observations = envs.reset(rng)
+    for _ in range(60):
+        width = {"Pendulum-v1": 1, "MountainCarContinuous-v0": 1, "CartPole-v0": 2, "CartPole-v1": 2}.get(name, 3)
+        drawn = np.eye(width)[rng.integers(width, size=8)] if discrete else rng.uniform(-1, 1, (8, 1))
+        actions = drawn.astype(np.float32)
+        states, gold = retell(observations, actions)
+        np.testing.assert_allclose(world.observe(states), observations, atol=1e-5)
+        step = envs.step(actions)
+        np.testing.assert_allclose(gold, step.rewards, atol=1e-4)
+        observations = step.observations
