@@ -46,6 +46,7 @@ def test_segments_are_imagined_judged_by_the_true_world_and_cost_no_real_step(se
     assert (learner.steps.learn, learner.steps.imagined) == (real, dreamt + 12 * 5)
     assert real > 0
     assert len({one.id for one in pool}) == len({one.episode for one in pool}) == 12  # none overlaps another
+    assert len({one.observations[0].tobytes() for one in pool}) > 6  # from wherever it was
     seen = {row.tobytes() for row in learner.ground.data.observations}
     for one in pool:
         assert [row.tobytes() in seen for row in one.observations] == [True] + [False] * 4  # from a real state on
