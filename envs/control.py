@@ -111,7 +111,8 @@ class ControlSettings(Settings):
         action, size = env.action_space, math.prod(env.observation_space.shape or ())
         after: AfterEnd = "end" if self.variable_horizon else self.after_end
         environments = self._stepper(name, plain, horizon, after)
-        retell = retelling(WORLDS[name](after == "end")) if name in WORLDS else None
+        known = name in WORLDS and after != "restart"
+        retell = retelling(WORLDS[name](after == "end")) if known else None
         if self.hide or self.flicker or self.stack > 1:
             retell = None
             environments = partial(_partial, environments, size, self.hide, self.flicker, self.stack)

@@ -228,13 +228,15 @@ class Config(Settings):
         if not isinstance(learner, Imagines):
             raise ConfigError(
                 f"select.imagined: learner.kind={self.learner.model_dump()['kind']} has no policy in a learned world, "
-                "whose behaviour could be asked about: set learner.kind=dyna or learner.kind=backprop, or leave it out"
+                "whose behaviour could be asked about: leave it out, or for a task of control set learner.kind=dyna or "
+                "learner.kind=backprop"
             )
         if not isinstance(task, Retells) or task.retell is None:
             raise ConfigError(
                 f"select.imagined: what is imagined of {task.name} can neither be drawn nor judged, since its "
-                "simulator's states cannot be told from what is seen. Those of classic control can, as long as nothing "
-                "is hidden: Pendulum-v1, CartPole-v1, Acrobot-v1, MountainCar-v0, MountainCarContinuous-v0"
+                "simulator's states cannot be told from what is seen. Those of task.kind=point can, and of classic "
+                "control as long as nothing is hidden or restarted: Pendulum-v1, CartPole-v1, Acrobot-v1, "
+                "MountainCar-v0, MountainCarContinuous-v0"
             )
 
     # Fields are typed by what all settings have; what a role's settings have besides, its protocol says.

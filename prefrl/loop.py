@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Generic, Literal, TypeAlias
+from typing import Generic, Literal, TypeAlias, cast
 
 import numpy as np
 from pydantic import Field
@@ -144,9 +144,7 @@ class Loop(Generic[C]):
         if count <= 0:
             return []
         with self._timed("sample"):
-            sample = (
-                self.learner.imagine if self.imagined and isinstance(self.learner, Imagines) else self.learner.sample
-            )
+            sample = cast(Imagines[C], self.learner).imagine if self.imagined else self.learner.sample
             pool = sample(int(count * self.candidates * self.settings.pool), rng.sample)
             queries = self.selector.select(pool, self.reward, count, rng.select)
             if not queries:

@@ -226,14 +226,25 @@ class Mapped(ControlTask, Protocol):
         """(n, O) -> (n, A): which actions there were."""
 
 
+class Retold(NamedTuple):
+    """What would be true of imagined steps."""
+
+    observations: Floats
+    """(n, O) float32: what is seen in these states, which may not be quite what was imagined."""
+    states: Floats
+    """(n, S) float64, of the simulator."""
+    gold: Floats
+    """(n,), of the actions in these states."""
+
+
 @runtime_checkable
 class Retells(ControlTask, Protocol):
     """A control task that may know what would be true of steps that were only imagined."""
 
     @property
-    def retell(self) -> Callable[[Floats, Floats], tuple[Floats, Floats]] | None:
-        """Observations (n, O) and actions (n, A) -> simulator states (n, S) that look like that, and the gold (n,) of
-        these actions in them: for people's eyes, and for oracles. None where what is seen does not tell the state."""
+    def retell(self) -> Callable[[Floats, Floats], Retold] | None:
+        """Imagined observations (n, O) and actions (n, A) -> the simulator's states that look most like them, for
+        people's eyes, and the gold, for oracles. None where what is seen does not tell the state."""
 
 
 @runtime_checkable

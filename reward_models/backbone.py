@@ -15,7 +15,7 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_MASKED_LM_MAPPING_N
 
 from prefrl.components import ConfigError
 from prefrl.exchange.transcripts import prompt_messages, response_messages
-from prefrl.policies.pretrained import context_of, first_line, load_tokenizer, load_weights
+from prefrl.policies.pretrained import beginning, context_of, first_line, load_tokenizer, load_weights
 from prefrl.protocols import TextTask
 from prefrl.reward_models.packing import MODELS, final_states, pack, use_packed_attention
 from prefrl.seeding import to_numpy
@@ -65,8 +65,9 @@ class Backbone:
                 raise ValueError(f"candidate {candidate.id[:12]} has no tokens: expected a prompt or a response")
             if context is not None and len(row) > context:
                 raise ValueError(
-                    f"candidate {candidate.id[:12]} has {len(row)} tokens, but the reward's backbone has a context of "
-                    f"{context}: leave it out, or choose a reward.backbone with a longer context"
+                    f"candidate {candidate.id[:12]}{beginning(candidate.prompt)} has {len(row)} tokens, but the "
+                    f"reward's backbone has a context of {context}: leave it out of what is imported, or choose a "
+                    "reward.backbone with a longer context"
                 )
         return rows
 

@@ -35,7 +35,7 @@ class Pendulum:
 
     def recognise(self, observations: Floats) -> Floats:
         cos, sin, velocity = observations.T
-        return _beside(np.arctan2(sin, cos), velocity)
+        return _beside(np.arctan2(sin, cos), velocity.clip(-8.0, 8.0))
 
     def legal(self, states: Floats) -> Bools | None:
         return None
@@ -120,7 +120,9 @@ class Acrobot:
 
     def recognise(self, observations: Floats) -> Floats:
         cos, sin, second_cos, second_sin, *spins = observations.T
-        return _beside(np.arctan2(sin, cos), np.arctan2(second_sin, second_cos), *spins)
+        found = _beside(np.arctan2(sin, cos), np.arctan2(second_sin, second_cos), *spins)
+        found[:, 2:] = found[:, 2:].clip(*_SPINS)
+        return found
 
     def legal(self, states: Floats) -> Bools | None:
         return None
@@ -197,7 +199,7 @@ class MountainCar:
         return states.astype(np.float32)
 
     def recognise(self, observations: Floats) -> Floats:
-        return observations.astype(np.float64)
+        return observations.astype(np.float64).clip([-1.2, -0.07], [0.6, 0.07])
 
     def legal(self, states: Floats) -> Bools | None:
         return None

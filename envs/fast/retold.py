@@ -7,10 +7,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from prefrl.protocols import Dynamics, Recognised
+from prefrl.protocols import Dynamics, Recognised, Retold
 from prefrl.types import Floats
 
-Retell: TypeAlias = Callable[[Floats, Floats], tuple[Floats, Floats]]
+Retell: TypeAlias = Callable[[Floats, Floats], Retold]
 """As `prefrl.protocols.Retells` has it."""
 
 
@@ -19,10 +19,10 @@ def retelling(world: Dynamics) -> Retell | None:
     if not isinstance(world, Recognised):
         return None
 
-    def retell(observations: Floats, actions: Floats) -> tuple[Floats, Floats]:
+    def retell(observations: Floats, actions: Floats) -> Retold:
         states = world.recognise(observations)
         _, gold, _ = world.advance(states, actions, np.random.default_rng(0))
-        return states, gold
+        return Retold(world.observe(states), states, gold)
 
     return retell
 

@@ -122,6 +122,11 @@ def _nothing_learned(running: Run) -> str:
             f"nothing was learned: there are {shown} demonstrations and no judgements, and this learner learns from "
             "judgements; set learner.kind=clone, or sft for text"
         )
+    if not running.loop.store.counts()["answered"]:
+        return (
+            "nothing was learned: there is not a single answer in this run; ask for some with loop.labels, or begin "
+            "with a folder of judgements that `prefrl import` wrote"
+        )
     return "nothing was learned: no judgement ever preferred a candidate; look at the labeler's settings"
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from prefrl.protocols import Clocked, Task
 from prefrl.types import Json
@@ -54,6 +54,11 @@ def pace(task: Task) -> float | None:
     return task.steps_per_second if isinstance(task, Clocked) else None
 
 
+def judged(metrics: Mapping[str, Any]) -> bool:
+    """Whether a model was asked in place of people, which takes none of their time."""
+    return "label/pairs" in metrics
+
+
 def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: float = 0.0) -> Json:
     """One flat account of a run from its metrics; None where something was not measured.
 
@@ -80,7 +85,7 @@ def summarise(rows: list[Json], task: Task, seed: int, origin: Origin, people: f
         "fluency_before": first.get("evaluate/fluency"),
         "fluency_after": last.get("evaluate/fluency"),
         "steps_per_second": pace(task),
-        "people_seconds": people or None,
+        "people_seconds": people or (0.0 if judged(last) else None),
         "seconds": seconds | {"total": sum(seconds.values())},
         "source": origin.source,
         "overrides": list(origin.overrides),

@@ -85,6 +85,9 @@ class BackpropSettings(Settings):
     def work(self) -> float:
         return float(self.updates * self.branches * self.steps)
 
+    def real_work(self) -> float:
+        return float(self.episodes)
+
     def build(self, task: Task, rng: np.random.Generator) -> Backprop:
         """Raises `ConfigError` for discrete actions."""
         found = simulated(task, f"learner kind {self.kind!r} plays real episodes of control")
@@ -127,16 +130,14 @@ class Backprop:
     def sample(self, count: int, rng: np.random.Generator) -> list[Segment]:
         """Segments of real episodes of the policy as it is; the world learns from these as well."""
         if not self.ground.begun:
-            self._begin(count, rng)
+            self.ground.begin(count, played(self.actor(), rng), 64, rng)
         elif not self.ground.fresh:
             self._play(rng)
         return self.ground.segments(count, rng)
 
     def imagine(self, count: int, rng: np.random.Generator) -> list[Segment]:
-        """Segments of imagined branches of the policy as it is; first real episodes, where there are none yet."""
-        if not self.ground.begun:
-            self._begin(count, rng)
-        return self.ground.imagine(count, played(self.actor(), rng), rng)
+        """Segments of imagined branches of the policy as it is."""
+        return self.ground.imagine(count, self._settings.episodes, played(self.actor(), rng), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then take `updates` gradient steps through it.
@@ -166,7 +167,7 @@ class Backprop:
         metrics = dict(found.metrics)
         if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
-            worth = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
+            worth = self.ground.imagined_returns(starts, played(self.actor(), None), reward, rng)
             metrics["imagined"] = float(worth.mean())
         return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
@@ -198,9 +199,6 @@ class Backprop:
         self._player.load(state["player"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._imagined = state["imagined"]
-
-    def _begin(self, count: int, rng: np.random.Generator) -> None:
-        self.ground.begin(count, played(self.actor(), rng), 64, rng)
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)

@@ -3,7 +3,8 @@
 Variant: Sutton 1991, with the world of MBPO (Janner et al. 2019): branches begin in real states, are short where the
 world cannot be trusted, and are learned from. What differs: the learner inside is `learner.kind=control` (PPO), where
 MBPO has SAC; it learns from imagined steps alone, and rewards are the newest fit's, so nothing has to be relabelled.
-Queries are about real episodes, and the world learns from those too: a round plays some once, before it asks.
+Queries are about real episodes, and the world learns from those too: a round plays some once, before it asks. With
+`select.imagined` they are about imagined ones, and a round plays before it learns.
 """
 
 from __future__ import annotations
@@ -121,16 +122,14 @@ class Dyna:
         are none of that either.
         """
         if not self.ground.begun:
-            self._begin(count, rng)
+            self.ground.begin(count, played(self.actor(), rng), self._settings.inside.environments, rng)
         elif not self.ground.fresh:
             self._play(rng)
         return self.ground.segments(count, rng)
 
     def imagine(self, count: int, rng: np.random.Generator) -> list[Segment]:
-        """Segments of imagined branches of the policy as it is; first real episodes, where there are none yet."""
-        if not self.ground.begun:
-            self._begin(count, rng)
-        return self.ground.imagine(count, played(self.actor(), rng), rng)
+        """Segments of imagined branches of the policy as it is."""
+        return self.ground.imagine(count, self._settings.episodes, played(self.actor(), rng), rng)
 
     def improve(self, reward: RewardModel[Segment], store: Store[Segment], rng: np.random.Generator) -> Metrics:
         """Fit the world on all real steps, then let the policy learn in it.
@@ -155,7 +154,7 @@ class Dyna:
         metrics = dict(found.metrics)
         if self.ground.world.fitted and reward.fitted:
             starts = np.stack([one.observations[0] for one in found.candidates])
-            worth = self.ground.imagined(starts, played(self.actor(), None), reward, rng)
+            worth = self.ground.imagined_returns(starts, played(self.actor(), None), reward, rng)
             metrics["imagined"] = float(worth.mean())
         return replace(found, metrics=metrics, notes=(*found.notes, *self.ground.notes))
 
@@ -176,9 +175,6 @@ class Dyna:
         self.ground.load(state["ground"])
         self._inside.load(state["inside"])
         self._player.load(state["player"])
-
-    def _begin(self, count: int, rng: np.random.Generator) -> None:
-        self.ground.begin(count, played(self.actor(), rng), self._settings.inside.environments, rng)
 
     def _play(self, rng: np.random.Generator) -> None:
         self.ground.play(self._settings.episodes, played(self.actor(), rng), rng)

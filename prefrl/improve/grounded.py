@@ -26,7 +26,8 @@ AWAKE = (
 )
 REAL = (
     "{real} of {count} segments to ask about are real ones: the learned world cannot be followed for the {steps} steps "
-    "of a segment, or not often enough; make task.segment_seconds (or segment_steps) smaller, or raise learner.episodes"
+    "of a segment, or not often enough; make task.segment_seconds (or segment_steps) smaller, raise learner.episodes, "
+    "so that the world sees more, or learner.world.longest (now {longest})"
 )
 PASSES = 4
 """So often branches are imagined for segments to ask about, in place of those that were cut short."""
@@ -92,8 +93,13 @@ class Grounded:
         Raises ValueError where there are none of that either.
         """
         length, found = self._task.segment_steps, list[Segment]()
+        if (there := self._held()) < count:
+            raise ValueError(
+                f"the last {len(self._plays)} plays hold {there} segments of {length} steps within one episode, but "
+                f"{count} were asked for; lower loop.pool or the segment length, or raise learner.episodes"
+            )
         for back, rollout in enumerate(reversed(self._plays)):
-            held = len(windows(rollout, length)[0]) if back + 1 < len(self._plays) else count
+            held = len(windows(rollout, length)[0])
             name = f"play {self._played - back}"
             found = cut(rollout, length, min(held, count - len(found)), name, rng) + found
             if len(found) == count:
@@ -109,30 +115,37 @@ class Grounded:
         self._note("world", "" if world.reach else note)
         return metrics
 
-    def imagine(self, count: int, act: Act, rng: np.random.Generator) -> list[Segment]:
-        """Segments of as many imagined branches from real states, with the states that they look like and their gold.
+    def imagine(self, count: int, episodes: int, act: Act, rng: np.random.Generator) -> list[Segment]:
+        """Segments of as many imagined branches from real states, as they would look and with their gold.
 
-        Each is whole: none was cut where members part. Where too few are, real ones (`segments`) stand in, and a note
-        says so.
+        So many episodes are played first where none ever were. Each segment is whole: its branch was not cut where
+        members part. Where too few are, real ones (`segments`) stand in, and a note says so.
         """
+        if not self.begun:
+            self.play(episodes, act, rng)
         if self.fresh:
             self.learn(rng)
         assert self.data is not None
         assert isinstance(self._task, Retells)
         length, found = self._task.segment_steps, list[Segment]()
-        for number in range(PASSES if self.world.reach >= length else 0):
+        for _ in range(PASSES if self.world.reach >= length else 0):
             branches = Branches(Dream(self.world, self.data.starts), count - len(found))
             rollout, _ = collect(branches, branches.reset(rng), length, act)
             self.dreamt += rollout.ends.size
             whole = len(windows(rollout, length)[0])
-            found += cut(rollout, length, whole, f"imagined after play {self._played}, {number}", rng)
+            found += cut(rollout, length, whole, f"imagined {self.dreamt}", rng)
             if len(found) == count:
                 break
-        real, numbers = count - len(found), {"count": count, "steps": length}
+        real = count - len(found)
+        numbers = {"count": count, "steps": length, "longest": self.world.settings.longest}
         self._note("asked", REAL.format(real=real, **numbers) if real else "")
+        if real > self._held():
+            self.begin(real, act, len(self._plays[-1].ends), rng)
         return [_retold(self._task, one) for one in found] + (self.segments(real, rng) if real else [])
 
-    def imagined(self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator) -> Floats:
+    def imagined_returns(
+        self, starts: Floats, act: Act, reward: RewardModel[Segment], rng: np.random.Generator
+    ) -> Floats:
         """Learned returns (n,) of whole imagined episodes from these starts (n, O)."""
         branches = Branches(Dream(self.world, starts), len(starts), self._task.horizon)
         rollout, _ = collect(branches, branches.reset(rng), self._task.horizon, act)
@@ -156,6 +169,10 @@ class Grounded:
         self._plays = [Rollout(**one) for one in state["plays"]]
         self.world.load(state["world"])
 
+    def _held(self) -> int:
+        """How many segments the last plays hold."""
+        return sum(len(windows(rollout, self._task.segment_steps)[0]) for rollout in self._plays)
+
     def _note(self, of: str, text: str) -> None:
         self._notes = {name: told for name, told in self._notes.items() if name != of} | ({of: text} if text else {})
 
@@ -168,8 +185,7 @@ class Grounded:
 
 def _retold(task: Retells, one: Segment) -> Segment:
     assert task.retell is not None
-    states, gold = task.retell(one.observations, one.actions)
-    return replace(one, states=states, gold=gold)
+    return replace(one, **task.retell(one.observations, one.actions)._asdict())
 
 
 __all__ = ["Grounded", "all_legal"]

@@ -68,6 +68,8 @@ def improve(
             "judgement names a better one: import demonstrations, or raise loop.labels"
         )
     rows = Responses.of(chosen, writer.policy.task, writer.policy.device)
+    lengths = rows.lengths()
+    writer.policy.check_room(int(lengths.max()), chosen[int(lengths.argmax())].prompt)
     turns = [at for _ in range(settings.epochs) for at in shuffled(len(rows), settings.minibatch, rng)]
     return means(list(supervised(writer, settings, rows, writer.paced(turns)))) | {"responses": float(len(rows))}
 

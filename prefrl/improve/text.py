@@ -166,7 +166,7 @@ class TextLearnerSettings(Settings):
         if self.reference_every and self.reference_mix < 1 and self.policy.train == "lora":
             raise ValueError("parts of two adapters are no adapter between the two: with LoRA set reference_mix=1")
         if self.reference_every and self.policy.shard != "none":
-            raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=0")
+            raise ValueError("a reference that moves is kept whole: with policy.shard set reference_every=null")
         if self.reference_every and (self.beta == 0 or self.kl_stop is not None):
             raise ValueError("a reference that moves is for beta above 0, and kl_stop is for one that does not")
         if self.kl_target is not None and self.beta == 0:

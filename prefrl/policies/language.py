@@ -28,7 +28,7 @@ from prefrl.policies.logprobs import (
     response_states,
     shortcuts_of,
 )
-from prefrl.policies.pretrained import context_of, quiet
+from prefrl.policies.pretrained import beginning, context_of, quiet
 from prefrl.policies.responses import Responses
 from prefrl.protocols import TextTask
 from prefrl.seeding import generator, to_numpy
@@ -231,7 +231,7 @@ class LanguagePolicy:
     def opened(self, prompt: str) -> tuple[int, ...]:
         """The tokens that the model goes on from. Raises `ValueError` where its context has no room for a response."""
         ids = self.task.encode(prompt)
-        self._check_room(len(ids) + self.task.response_tokens)
+        self.check_room(len(ids) + self.task.response_tokens, prompt)
         return ids
 
     def sampling(self, samples: int, temperature: float | None = None) -> Sampling:
@@ -241,7 +241,7 @@ class LanguagePolicy:
 
     def start_logp(self, responses: Responses, temperature: float | None = None) -> Tensor:
         """(B, L) log-probabilities under the starting policy, without gradients."""
-        self._check_room(int(responses.lengths().max()))
+        self.check_room(int(responses.lengths().max()))
         temperature = self.temperature if temperature is None else temperature
         with self._at_the_start(), enough_memory("learner.policy.chunk", self.part):
             return self._all_logp(self.start, responses, temperature)
@@ -292,12 +292,13 @@ class LanguagePolicy:
             # In place: the optimiser holds these very tensors.
             parameter.copy_(self.keeping.share(found, parameter))
 
-    def _check_room(self, tokens: int) -> None:
+    def check_room(self, tokens: int, prompt: str = "") -> None:
+        """Raises `ValueError` where the model's context has no room for so many tokens."""
         context = context_of(self.model)
         if context is not None and tokens > context:
             raise ValueError(
-                f"a prompt and its response need up to {tokens} tokens, and the model's context has {context}: leave "
-                "that prompt out, or lower task.response_tokens"
+                f"a prompt and its response{beginning(prompt)} need up to {tokens} tokens, and the model's context has "
+                f"{context}: leave that prompt out, or lower task.response_tokens"
             )
 
     def _trained(self) -> dict[str, torch.nn.Parameter]:

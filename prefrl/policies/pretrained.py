@@ -22,6 +22,8 @@ from transformers.utils.logging import (
 from prefrl.components import ConfigError
 
 M = TypeVar("M", bound=PreTrainedModel)
+NAMED = 40
+"""So many characters of a prompt say which one a message is about."""
 Precision: TypeAlias = Literal["float32", "bfloat16"]
 
 
@@ -96,6 +98,11 @@ def window_of(model: PreTrainedModel) -> int | None:
     """How many tokens back a token looks, where some layer's attention has such a window."""
     found = [size for name in WINDOWS if isinstance(size := getattr(model.config, name, None), int) and size > 0]
     return min(found, default=None)
+
+
+def beginning(prompt: str) -> str:
+    """Which prompt a message is about, in brackets after a space; nothing where there is none."""
+    return f" (its prompt begins {prompt[:NAMED]!r})" if prompt else ""
 
 
 def first_line(error: Exception) -> str:

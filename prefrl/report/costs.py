@@ -24,7 +24,7 @@ class Spent(NamedTuple):
     """Steps a second in the world; None where there is no world outside, as for texts."""
     answers: int
     people: float | None
-    """Seconds that people took for their answers; None where nobody measured it."""
+    """Seconds that people took for their answers; None where nobody measured it, 0 where a model gave them."""
     machine: float
     """Seconds of computing; waiting for people is not among them."""
 
@@ -46,7 +46,7 @@ def costs(spent: Spent) -> tuple[Cost, ...]:
         found.append(Cost("the world", spent.steps / spent.rate, how))
     if spent.people:
         found.append(Cost("people", spent.people, f"{show_count(spent.answers, 'answer')}, as the page timed them"))
-    elif spent.answers:
+    elif spent.people is None and spent.answers:
         how = f"{show_count(spent.answers, 'answer')} at {AN_ANSWER:g} s each"
         found.append(Cost("people", AN_ANSWER * spent.answers, how))
     return (*found, Cost("the machine", spent.machine, "all stages but waiting for people"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from prefrl.components import Settings
 from prefrl.config import Config
-from prefrl.evaluate.summary import pace
+from prefrl.evaluate.summary import judged, pace
 from prefrl.report.costs import Spent
 from prefrl.store import Store
 
@@ -41,6 +41,7 @@ def estimate(config: Config) -> Spent:
     learned = config.loop.rounds * config.learner.real_work() / small.learner.real_work()
     steps = {"learn": learned, "query": growth["sample"], "evaluate": evaluations / 2}  # of the two in `one`
     spent = sum(one.get(f"steps/{purpose}", 0.0) * factor for purpose, factor in steps.items())
+    people = 0.0 if judged(one) else None
     return Spent(
-        round(spent), pace(loop.task), config.loop.labels, None, seconds + start["seconds/evaluate"] * evaluations
+        round(spent), pace(loop.task), config.loop.labels, people, seconds + start["seconds/evaluate"] * evaluations
     )

@@ -19,9 +19,13 @@ from prefrl.evaluate.health import warnings
         (9, {"improve/explained": math.nan}, []),
         (1, {"improve/equal_groups": 1.0}, ["reward"]),
         (1, {"improve/equal_groups": 0.99}, []),
+        (1, {"improve/equal_groups": 0.3, "improve/reward_std": 0.0}, ["reward"]),
+        (1, {"improve/reward_std": 0.1}, []),
         (1, {"label/position_bias": 0.5}, ["judge"]),
         (1, {"label/position_bias": -0.3}, ["judge"]),
         (1, {"label/position_bias": 0.1}, []),
+        (1, {"label/refused": 1.0}, ["refused"]),
+        (1, {"label/refused": 0.2}, []),
         (9, {}, []),
     ],
 )

@@ -217,3 +217,8 @@ def test_the_policy_in_torch_acts_as_it_does_in_numpy() -> None:
         policy.observe(PLACES * 3)
         found: Floats = policy.traced(torch.from_numpy(PLACES * 9)).detach().numpy()
         np.testing.assert_allclose(found, policy.numpy_actor()(PLACES * 9, None)[1], atol=1e-6)
+
+
+def test_real_steps_grow_by_episodes_and_work_by_gradient_steps() -> None:
+    settings = BackpropSettings(episodes=3, updates=10, branches=4, steps=5)
+    assert (settings.work(), settings.real_work()) == (200, 3)

@@ -60,6 +60,7 @@ def test_a_world_that_cannot_be_followed_is_not_asked_about() -> None:
     pool = learner.imagine(12, np.random.default_rng(1))
     assert all(one.episode.startswith("play") for one in pool)
     (note,) = learner.ground.notes
+    assert "learner.world.longest (now 4)" in note
     assert note.startswith("12 of 12 segments to ask about are real ones: the learned world cannot be followed")
     again = DynaSettings(**DYNA).build(point(), np.random.default_rng(0))
     again.load(deepcopy(learner.state()))
@@ -74,7 +75,7 @@ def test_a_run_asks_about_what_was_imagined_and_draws_it(tmp_path: Path) -> None
         rounds = [done.metrics for done in loop.run()]
         asked = [one for judged in store.judged() for one in judged.query.candidates]
         assert len(asked) == 16
-        assert all(one.episode.startswith("imagined after play") for one in asked)
+        assert all(one.episode.startswith("imagined ") for one in asked)
         assert cast(DrawnTask[Segment], loop.task).frames(asked[0]).shape == (5, 120, 120, 3)
         # The first episodes, and two in each round: nobody asked for more.
         assert rounds[2]["steps/learn"] - rounds[1]["steps/learn"] == 2 * 40
@@ -86,6 +87,7 @@ def test_a_run_asks_about_what_was_imagined_and_draws_it(tmp_path: Path) -> None
         ({"learner": {"kind": "control"}}, r"learner\.kind=control has no policy in a learned world"),
         ({"task": {"kind": "tmaze"}}, r"what is imagined of tmaze can neither be drawn nor judged"),
         ({"task": {"kind": "control", "hide": [2]}}, r"of Pendulum-v1 can neither .* as long as nothing is hidden"),
+        ({"task": {"kind": "control", "after_end": "restart"}}, r"of Pendulum-v1 can neither .* or restarted"),
     ],
 )
 def test_what_nobody_could_imagine_or_judge_is_refused_before_it_begins(
@@ -94,3 +96,13 @@ def test_what_nobody_could_imagine_or_judge_is_refused_before_it_begins(
     config = Config.parse(toy().model_dump() | settings)
     with Store[Segment](tmp_path / "store") as store, pytest.raises(ConfigError, match=says):
         config.build(store)
+
+
+def test_real_stand_ins_are_played_where_the_last_plays_hold_too_few() -> None:
+    learner = DynaSettings(**DYNA | {"world": WORLD | {"longest": 4}}).build(point(), np.random.default_rng(0))
+    assert len(learner.imagine(12, np.random.default_rng(1))) == 12
+    spent = learner.steps.learn
+    assert len({one.id for one in learner.imagine(400, np.random.default_rng(2))}) == 400
+    assert learner.steps.learn > spent
+    with pytest.raises(ValueError, match=r"plays hold \d+ segments of 5 steps .* raise learner\.episodes"):
+        learner.ground.segments(4000, np.random.default_rng(3))

@@ -118,6 +118,14 @@ def test_ties_alone_teach_nothing_and_that_is_said(toy_reviews: Reviews) -> None
         one.improve(NO_REWARD, store, np.random.default_rng(0))
 
 
+def test_what_is_longer_than_the_context_is_refused_and_named(toy_reviews: Reviews) -> None:
+    one = learner(toy_reviews)
+    prompt = "The plot was " + "so very long and dull " * 200
+    store = preferred.answers([Response(prompt, lead) for lead in ("the one", "another")])
+    with pytest.raises(ValueError, match=r"its response \(its prompt begins 'The plot was so very long.*context has"):
+        one.improve(NO_REWARD, store, np.random.default_rng(0))
+
+
 def test_demonstrations_are_learned_without_any_judgement(toy_reviews: Reviews, tmp_path: Path) -> None:
     one = learner(toy_reviews, epochs=4)
     (written,) = one.policy.respond(["The plot was"], 1, np.random.default_rng(0)).candidates(toy_reviews.tokenizer)

@@ -12,6 +12,7 @@ import torch
 from pydantic import ValidationError
 
 from prefrl.components import ConfigError
+from prefrl.config import Config
 from prefrl.envs.text import Reviews
 from prefrl.improve.groups import advantages_of
 from prefrl.improve.text import TextLearner, TextLearnerSettings, text_formula
@@ -536,3 +537,19 @@ def test_a_policy_takes_over_what_was_learned_from_its_own_start_alone(toy_revie
         next(one.policy.start.parameters())[5] += 0.01
     with pytest.raises(ValueError, match="started from other weights"):
         learner(toy_reviews).load(one.state())
+
+
+@pytest.mark.parametrize(
+    ("preset", "lines"),
+    [
+        # TRL's RLOO: the KL in the reward, before the baseline; one step without a ratio.
+        ("trl-rloo", ["[ log pi(y_t) A_i ]", "A_i = R_i - mean of the prompt's other R_j", "score(y_i) - 0.05 sum_t"]),
+        # OpenRLHF's: the KL of each token after the baseline, whitened, a clip over all tokens.
+        ("openrlhf-rloo", ["clip(r, 0.8, 1.2)", "A_t = R_i - mean of the prompt's other R_j - 0.01 K_t", "whitened"]),
+        # N+: GAE on a reward at the end and the KL of each token, values clipped, a penalty without an end.
+        ("n+ppo", ["A_t = G_t, whitened", "0.95^k", "[t = T] score(y_i) - 1 [no end token] - 0.05 [log pi_old", "V within 0.2"]),
+    ],
+)  # fmt: skip
+def test_presets_are_the_formulas_of_other_systems(preset: str, lines: list[str]) -> None:
+    formula = Config.load(f"text/{preset}").learner.formula()
+    assert [line for line in lines if line not in formula] == []

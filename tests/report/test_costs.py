@@ -31,6 +31,8 @@ def test_what_a_page_measured_of_people_is_taken_for_what_it_is() -> None:
 
 
 def test_a_machine_that_works_alone_is_no_bottleneck() -> None:
+    (judged,) = costs(Spent(steps=1, rate=None, answers=100, people=0.0, machine=9.0))
+    assert judged.who == "the machine"
     (alone,) = costs(Spent(steps=1, rate=None, answers=0, people=None, machine=9.0))
     assert "bottleneck" not in account([alone])
 

@@ -56,7 +56,7 @@ def test_what_does_not_fit_the_context_is_named_with_both_lengths(toy_reviews: R
     reward, (one,) = of_folder(tmp_path, gpt2(), toy_reviews, eos_token="<eos>"), some(toy_reviews, 1)
     long = replace(one, prompt_tokens=(5,) * 60, tokens=(5,) * 5)
     for ask in (reward.stack, reward.score, reward.features):
-        with pytest.raises(ValueError, match=rf"candidate {long.id[:12]} has 65 tokens.* context of 64"):
+        with pytest.raises(ValueError, match=rf"candidate {long.id[:12]} .its prompt begins .* has 65 tokens.* of 64"):
             ask([one, long])
 
 

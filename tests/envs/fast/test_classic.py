@@ -180,8 +180,23 @@ def test_states_are_told_from_what_is_seen_and_what_is_imagined_is_judged_as_gym
         width = {"Pendulum-v1": 1, "MountainCarContinuous-v0": 1, "CartPole-v0": 2, "CartPole-v1": 2}.get(name, 3)
         drawn = np.eye(width)[rng.integers(width, size=8)] if discrete else rng.uniform(-1, 1, (8, 1))
         actions = drawn.astype(np.float32)
-        states, gold = retell(observations, actions)
-        np.testing.assert_allclose(world.observe(states), observations, atol=1e-5)
+        told = retell(observations, actions)
+        np.testing.assert_allclose(world.observe(told.states), observations, atol=1e-5)
+        np.testing.assert_allclose(told.observations, observations, atol=1e-5)
         step = envs.step(actions)
-        np.testing.assert_allclose(gold, step.rewards, atol=1e-4)
+        np.testing.assert_allclose(told.gold, step.rewards, atol=1e-4)
         observations = step.observations
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "Acrobot-v1", "MountainCar-v0"])
+def test_what_cannot_be_is_told_as_what_looks_most_like_it(name: str) -> None:
+    world = WORLDS[name](False)
+    retell = retelling(world)
+    assert retell is not None
+    real = world.observe(world.start(4, np.random.default_rng(0)))
+    told = retell(1.7 * real + np.float32(9.0) * (np.arange(real.shape[1]) == real.shape[1] - 1), np.eye(4)[:, :3])
+    again = retell(told.observations, np.eye(4)[:, :3])
+    np.testing.assert_allclose(again.observations, told.observations, atol=1e-6)
+    if name == "Pendulum-v1":
+        np.testing.assert_allclose(np.linalg.norm(told.observations[:, :2], axis=1), 1.0, rtol=1e-6)
+        assert (np.abs(told.states[:, 1]) <= 8).all()
