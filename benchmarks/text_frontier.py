@@ -46,6 +46,8 @@ WRITES = (*RUBRIC, "learner.updates=30", "learner.schedule=linear")
 ON_RUBRIC: Runs = {
     "RLOO": ("text/reviews-rubric", ()),
     "RLOO, worst of three": ("text/reviews-rubric", ("reward.combine.by=worst",)),
+    "GRPO": ("text/reviews-rubric", ("learner.algorithm=grpo",)),
+    "REINFORCE": ("text/reviews-rubric", ("learner.algorithm=reinforce",)),
     "PPO": ("text/reviews-ppo", (*WRITES, "learner.beta=0.2", "learner.critic.network=shared")),
     "online DPO": ("text/reviews-online-dpo", (*WRITES, "learner.beta=0.2")),
     "RAFT": ("text/reviews-raft", (*WRITES, "learner.beta=0.2")),
