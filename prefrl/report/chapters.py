@@ -317,13 +317,14 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
     labels = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
     curves = [Line(record.series(f"label/{n}"), c, n, d) for n, c, d in labels]
     shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
+    about = " They are about what the policy would do, imagined in its learned world." if record.imagined else ""
     curves += [Line(record.series("label/demonstrations"), "improve", "shown", "-.")] if shown else []
     steps = [("learn", "improve", "-"), ("query", "sample", "--"), ("evaluate", "evaluate", ":")]
     return (
         Card(
             "Labels",
             plots.lines("labels", at, curves, zero=True),
-            f"Queries asked, answered and skipped so far.{shown}",
+            f"Queries asked, answered and skipped so far.{about}{shown}",
         ),
         Card(
             f"{facts.words.spent}s".capitalize(),

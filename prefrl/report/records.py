@@ -61,6 +61,8 @@ class Record:
     config: str
     planned: int | None
     """Rounds that the settings ask for."""
+    imagined: bool
+    """Whether queries are about what the policy would do."""
     reliability: tuple[Bin, ...]
     """Of the held-out comparisons of the newest fit."""
     fitted_round: int | None
@@ -122,7 +124,8 @@ def read(folder: Path, examples: bool = True) -> Record:
         summary=summary,
         rounds=_rounds(folder / "metrics.jsonl", missing),
         config=visible(config, MAX_CONFIG),
-        planned=_planned(config),
+        planned=whole(_setting(config, "loop").get("rounds")),
+        imagined=_setting(config, "select").get("imagined") is True,
         reliability=_reliability(held_out, missing),
         fitted_round=whole(held_out.get("round")),
         before=_examples(folder / "examples" / "before.json", missing) if examples else (),
@@ -214,12 +217,13 @@ def _config(path: Path, missing: list[str]) -> str:
     return path.read_bytes().decode("utf-8", "replace")
 
 
-def _planned(config: str) -> int | None:
+def _setting(config: str, name: str) -> Json:
+    """A part of the settings; empty where they cannot be read."""
     try:
         settings = yaml.safe_load(config)
     except (yaml.YAMLError, ValueError, RecursionError):
-        return None
-    return whole(mapping(mapping(settings).get("loop")).get("rounds"))
+        return {}
+    return mapping(mapping(settings).get(name))
 
 
 def _reliability(held_out: Json, missing: list[str]) -> tuple[Bin, ...]:

@@ -186,7 +186,11 @@ def test_a_learned_world_is_held_against_the_real_one(tmp_path: Path) -> None:
         world = {"improve/world_held_out": 0.1 / i, "improve/reach": reach, "improve/branch": 0.9 * reach}
         return line(i, **world, **{"evaluate/imagined": 0.2 * i})
 
-    found = page(run_folder(tmp_path / "run", [line(0), dreamt(1, 20.0), dreamt(2, 30.0)], summary=summary()))
+    folder = run_folder(tmp_path / "run", [line(0), dreamt(1, 20.0), dreamt(2, 30.0)], summary=summary())
+    found = page(folder)
+    assert "about what the policy would do" not in found.text
+    (folder / "config.yaml").write_text("select: {kind: uniform, imagined: true}")
+    assert "They are about what the policy would do, imagined in its learned world." in page(folder).text
     assert "Imagined and real return" in found.text
     assert "Error of the learned world" in found.text
     assert "stopped dreaming" not in found.text
