@@ -364,7 +364,7 @@ def _dry_run(config: Config, seeds: int) -> None:
     from prefrl.report.costs import account, costs
     from prefrl.stages import estimate
 
-    spent, whole = estimate(config), "the whole" if seeds == 1 else "each of the runs"
+    spent, whole = estimate(config, say), "the whole" if seeds == 1 else "each of the runs"
     say(f"everything builds and one small round runs; {whole} would take about {duration(spent.machine)}")
     say(f"what it would cost outside a simulator. {account(costs(spent))}")
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from prefrl.components import Settings
 from prefrl.config import Config
 from prefrl.evaluate.summary import judged, pace
+from prefrl.protocols import Noted
 from prefrl.report.costs import Spent
+from prefrl.stages.labels import Tell
 from prefrl.store import Store
 
 
@@ -18,16 +20,19 @@ def shrink(config: Config) -> Config:
     return config.model_copy(update=parts)
 
 
-def estimate(config: Config) -> Spent:
+def estimate(config: Config, tell: Tell = lambda _: None) -> Spent:
     """What a run would take, about, from one small round of the true task in a temporary folder.
 
-    Evaluation is done at its true size. A starting policy that has to be made first is made, and kept.
+    `tell` is given what the task has to say of itself. Evaluation is done at its true size. A starting policy that has
+    to be made first is made, and kept.
     """
     small = shrink(config)
     learner = small.learner.with_evaluation_of(config.learner)
     small = small.model_copy(update={"task": config.task, "learner": learner})
     with tempfile.TemporaryDirectory() as scratch, Store(Path(scratch)) as store:
         loop = small.build(store)
+        for note in loop.task.notes if isinstance(loop.task, Noted) else ():
+            tell(note)
         start, one = (round.metrics for round in loop.run())
     growth = {
         "sample": config.loop.labels / small.loop.labels if small.loop.labels else 0.0,

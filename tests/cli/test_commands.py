@@ -178,6 +178,14 @@ def test_a_dry_run_estimates_and_writes_nothing(prefrl: Shell, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dry_run_tells_what_the_task_tells(prefrl: Shell) -> None:
+    small = (
+        "task.kind=control task.horizon=20 learner.environments=2 learner.rollout_steps=10 learner.steps_per_round=40"
+    )
+    assert prefrl(f"run control/toy --dry-run {small}") == 0
+    assert "segments have 10 steps: an episode of 20 is shorter than 1.5 seconds" in prefrl.out
+
+
 @pytest.mark.slow
 def test_a_second_run_into_the_folder_of_another_is_refused(prefrl: Shell) -> None:
     assert prefrl(f"run control/toy --out run {SMALL}") == 0
