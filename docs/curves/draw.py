@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 HERE = Path(__file__).parent
 INK, GREY = "#1f5fa8", "0.8"
 TEXT = {
-    "rloo": ("RLOO", "RLOO, worst of three"),
+    "rloo": ("RLOO", "GRPO", "RLOO, worst of three"),
     "ppo": ("PPO",),
     "online_dpo": ("online DPO",),
     "raft": ("RAFT",),
@@ -26,7 +26,7 @@ CONTROL = {
 """Figure -> methods of `control_methods.csv`."""
 TASKS = ("control/hopper", "control/cartpole", "control/pendulum", "text/reviews")
 ASKED = {"information+k_medoids": "by disagreement", "uniform": "uniform"}
-STYLES = ("-", "--")
+STYLES = ("-", "--", "-.")
 
 
 def main() -> None:
@@ -108,7 +108,7 @@ def of_questions(rows: list[dict[str, str]]) -> Figure:
     figure.set_size_inches(10, 2.5)
     for ax, task in zip(axes, TASKS, strict=True):
         ax.set(title=task, ylabel="")
-        for (name, said), style, color in zip(ASKED.items(), STYLES, (INK, "0.45"), strict=True):
+        for (name, said), style, color in zip(ASKED.items(), STYLES, (INK, "0.45"), strict=False):
             own = [row for row in rows if (row["task"], row["selector"]) == (task, name)]
             at = sorted({int(row["labels"]) for row in own})
             found = [[float(row["accuracy"]) for row in own if int(row["labels"]) == labels] for labels in at]
