@@ -25,6 +25,10 @@ TASKS = ("gold", "learned", "improve", "label", "evaluate", "ink")
 """Colours of several tasks, by turns."""
 INTERVAL = 1.96
 """Standard errors on each side of a mean."""
+IMAGINED = (
+    " They are about what the policy would do, imagined in its learned world, or about what it did where that world could "
+    "not be followed for a whole segment."
+)
 TRAINING = {
     "Entropy": ("improve/entropy", "How undecided the policy is, in nats a step: it falls as it makes up its mind."),
     "Step size": (
@@ -317,7 +321,7 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
     labels = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
     curves = [Line(record.series(f"label/{n}"), c, n, d) for n, c, d in labels]
     shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
-    about = " They are about what the policy would do, imagined in its learned world." if record.imagined else ""
+    about = IMAGINED if record.imagined else ""
     curves += [Line(record.series("label/demonstrations"), "improve", "shown", "-.")] if shown else []
     steps = [("learn", "improve", "-"), ("query", "sample", "--"), ("evaluate", "evaluate", ":")]
     return (
