@@ -26,8 +26,8 @@ TASKS = ("gold", "learned", "improve", "label", "evaluate", "ink")
 INTERVAL = 1.96
 """Standard errors on each side of a mean."""
 IMAGINED = (
-    " They are about what the policy would do, imagined in its learned world, or about what it did where that world could "
-    "not be followed for a whole segment."
+    " They are about what the policy would do, imagined in its learned world, or about what it did where that world "
+    "could not be followed for a whole segment."
 )
 TRAINING = {
     "Entropy": ("improve/entropy", "How undecided the policy is, in nats a step: it falls as it makes up its mind."),

@@ -138,6 +138,11 @@ FIRST_SCREEN = """(controls) => {
   return {share, hidden: controls.filter((id) => !seen(id)), scrolls};
 }"""
 """The share of the window that is for what is judged, and which controls cannot be tapped as they stand."""
+AS_IT_COMES_IN = """() => {
+  document.querySelector("[data-testid=question]").style.setProperty("animation", "appear 9s paused", "important");
+  return document.documentElement.scrollHeight - innerHeight;
+}"""
+"""By how much the page scrolls in the first moment of a question."""
 UPRIGHT = PHONE | {"viewport": {"width": 390, "height": 844}, "reduced_motion": "reduce"}
 PAIR = ["choose-first", "choose-first-much", "tie", "choose-second-slight", "incomparable", "skip", "undo"]
 ORDER = ["rank-row-0", "rank-row-3", "submit-ranking", "incomparable", "skip", "undo"]
@@ -158,3 +163,4 @@ def test_a_phone_shows_what_is_judged_on_half_of_it_and_all_answers_at_once(
     found = ann.page.evaluate(FIRST_SCREEN, controls)
     assert found["share"] >= 0.5
     assert (found["hidden"], found["scrolls"]) == ([], 0)
+    assert ann.page.evaluate(AS_IT_COMES_IN) == 0
