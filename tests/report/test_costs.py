@@ -6,7 +6,7 @@ from pathlib import Path
 from run_folders import folder_of_run
 
 from prefrl import Config
-from prefrl.evaluate.summary import pace
+from prefrl.evaluate.summary import Origin, pace, summarise
 from prefrl.report.chapters import chapters
 from prefrl.report.costs import Spent, account, costs
 from prefrl.report.facts import gather
@@ -54,6 +54,15 @@ def test_a_report_leaves_waiting_for_people_out_of_the_machine(tmp_path: Path) -
     assert "The world: 1 min 55 s (1,150 steps" in simulated
     assert "The machine: 1 min 30 s" in simulated
     assert "bottleneck is people" in simulated
+
+
+def test_the_answers_of_a_model_take_nobodys_time(tmp_path: Path) -> None:
+    task, origin = Config.load("control/toy").build_task(), Origin(None, (), [{"versions": {}}])
+    said = [
+        summarise([row], task, 0, origin)["people_seconds"] for row in ({"round": 0, "label/pairs": 4.0}, {"round": 0})
+    ]
+    assert said == [0.0, None]
+    assert "People:" not in outside(tmp_path / "judge", steps_per_second=10.0, people_seconds=0.0)
 
 
 def test_what_is_known_of_no_world_is_not_made_up(tmp_path: Path) -> None:
