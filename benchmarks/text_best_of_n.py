@@ -12,7 +12,9 @@ so best-of-n may do a little better than is said here, and clearly so below 0.19
 A learner that is farther away than the best of the whole pool is compared with that (`beyond` counts those).
 
 `gold_gain` and `fluency_gain`: learner minus best-of-n, the mean over seeds with a 95 % bootstrap interval over them
-(from five seeds; the range below that). The last line is one JSON object.
+(from five seeds; the range below that). `optimum_gain`: learner minus the optimum of the objective that policy gradients
+have, at the learner's KL: the start tilted by exp(score / beta), by weights on the same pool, which tells it well while
+it has many responses for each nat's worth. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -27,6 +29,9 @@ from statistics import mean
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import softmax
+from scipy.stats import entropy
 
 from prefrl.evaluate.best_of_n import expected, kl_bound
 from prefrl.protocols import TextTask
@@ -113,7 +118,8 @@ def compared(folder: Path, seed: int, size: Size) -> dict[str, Any]:
         return found, np.concatenate(ratios)
 
     base, _ = written(2)  # nothing is loaded yet: it is the starting policy that writes
-    curves = curves_of(reward.score(base), measures(base, task), size.pool)
+    judged, measured = reward.score(base), measures(base, task)
+    curves = curves_of(judged, measured, size.pool)
     learner.load(load_state(saved.folder, "learner"))
     drawn, ratios = written(3)
     kl = float(ratios.mean())
@@ -127,7 +133,24 @@ def compared(folder: Path, seed: int, size: Size) -> dict[str, Any]:
     for name, curve in curves.items():
         best = float(np.interp(kl, distances, curve))
         row |= {name: learned[name], f"best_{name}": best, f"curve_{name}": [curve[n - 1] for n in some]}
-    return row
+    weights = tilted(judged.reshape(-1, size.pool), kl)
+    return row | {"optimum_gold": float((weights * measured["gold"].reshape(weights.shape)).sum(1).mean())}
+
+
+def tilted(judged: Floats, kl: float) -> Floats:
+    """(P, N): weights on a pool as the objective's optimum has them, start x exp(score / beta), at this KL to the start.
+
+    Of N samples no weights are farther away than log N, and near that the pool's best alone is left.
+    """
+
+    def weights(log_beta: float) -> Floats:
+        return softmax(judged / np.exp(log_beta), axis=1)
+
+    def distance(log_beta: float) -> float:
+        return float(np.mean([entropy(w, np.full_like(w, 1 / len(w))) for w in weights(log_beta)]))
+
+    low, high = np.log(judged.std()) - 9, np.log(judged.std()) + 9
+    return weights(low if distance(low) <= kl else brentq(lambda x: distance(x) - kl, low, high, xtol=1e-3))
 
 
 def repeats(base: list[Response], pool: int) -> float:
@@ -159,6 +182,8 @@ def account(rows: list[dict[str, Any]], short: bool) -> dict[str, Any]:
             made |= {f"{name}_ours": mean(ours), f"{name}_peer": mean(peer)}
             curve = np.mean([row[f"curve_{name}"] for row in rows], 0)
             made[f"{name}_curve"] = {n: round(float(y), 3) for n, y in zip(rows[0]["n"], curve, strict=True)}
+    short_of = np.array([row["gold"] - row["optimum_gold"] for row in rows])
+    made |= {"optimum_gain": mean(short_of), "optimum_interval": interval(short_of)}
     made |= {"kl": mean(row["kl"] for row in rows), "beyond": sum(row["beyond"] for row in rows)}
     ours, peer = made.pop("gold_ours"), made.pop("gold_peer")
     made |= {"ours": ours, "peer": peer, "ratio": ours / peer, "spread": made["gold_interval"]}
