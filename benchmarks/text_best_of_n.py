@@ -12,9 +12,9 @@ so best-of-n may do a little better than is said here, and clearly so below 0.19
 A learner that is farther away than the best of the whole pool is compared with that (`beyond` counts those).
 
 `gold_gain` and `fluency_gain`: learner minus best-of-n, the mean over seeds with a 95 % bootstrap interval over them
-(from five seeds; the range below that). `optimum_gain`: learner minus the optimum of the objective that policy gradients
-have, at the learner's KL: the start tilted by exp(score / beta), by weights on the same pool, which tells it well while
-it has many responses for each nat's worth. The last line is one JSON object.
+(from five seeds; the range below that). `optimum_gain`: learner minus the optimum of the objective that policy
+gradients have, at the learner's KL: the start tilted by exp(score / beta), by weights on the same pool. That tells it
+well while exp(KL) is far below the pool's size. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def compared(folder: Path, seed: int, size: Size) -> dict[str, Any]:
 
 
 def tilted(judged: Floats, kl: float) -> Floats:
-    """(P, N): weights on a pool as the objective's optimum has them, start x exp(score / beta), at this KL to the start.
+    """(P, N) scores of a pool -> its weights in the objective's optimum, start x exp(score / beta), at this KL.
 
     Of N samples no weights are farther away than log N, and near that the pool's best alone is left.
     """

@@ -1,6 +1,7 @@
-"""Why a policy gradient lies below best-of-n on short reviews: one cause at a time, at equal KL and by the same reward.
+"""Why a policy gradient lies below best-of-n on short reviews: one cause at a time, at equal KL, by the same reward.
 
-    python benchmarks/text_causes.py [--seeds 5] [--first 0] [--only CAUSE ...] [--out runs/causes] [--to FILE] [--short]
+    python benchmarks/text_causes.py [--seeds 5] [--first 0] [--only CAUSE ...] [--out runs/causes] [--to FILE]
+        [--short]
 
 Each cause changes one thing in `text/reviews`. What a run's policy says, and the best of n of the start by that run's
 newest reward, are compared as in text_best_of_n.py. Beside both stands what is best at this KL: the start tilted by
@@ -80,8 +81,9 @@ def main() -> None:
             for change in list(CAUSES[cause])[: 2 if options.short else None]:
                 if any((r["cause"], r["change"], r["seed"]) == (cause, change, seed) for r in rows):
                     continue
-                unchanged = (r for r in rows if change == BASE == r["change"] and r["seed"] == seed)
-                rows.append({**next(unchanged, None) or measured(cause, change, seed, size, options.out), "cause": cause})
+                known = next((r for r in rows if change == BASE == r["change"] and r["seed"] == seed), None)
+                found = known or measured(cause, change, seed, size, options.out)
+                rows.append(found | {"cause": cause})
                 write(rows, table)
                 print(json.dumps(rows[-1]), flush=True)
     draw(rows).savefig(options.to.with_suffix(".svg"), metadata={"Date": None}, facecolor="white")

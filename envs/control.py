@@ -102,8 +102,15 @@ class ControlSettings(Settings):
 
     def build(self) -> GymnasiumTask:
         """Raises `ConfigError` for an unknown id, spaces that cannot be learned and impossible lengths."""
+        if self.variable_horizon and self.after_end != "absorb":
+            raise ConfigError(
+                f"task.after_end={self.after_end}: with task.variable_horizon=true episodes end, and nothing comes "
+                "after; set one of the two"
+            )
         single, probe = self._make()
         horizon, fps = self._horizon(), self._fps(probe)
+        if self.options:
+            self._try(probe)
         plain = adapted(single, probe)
         env = plain()
         # What is adapted, or has options, is not what the fast steppers step.
@@ -160,14 +167,16 @@ class ControlSettings(Settings):
                 f"task.env: unknown gymnasium environment {self.env!r}; {_nearest(self.env)} (one of your own is "
                 "known once its module is named in the command: prefrl --plugin my_env.py ...)"
             )
-        options: dict[str, Any] = {"max_episode_steps": self._horizon(), "disable_env_checker": True}
+        options: dict[str, Any] = {"disable_env_checker": True}
         try:
             probe = make(self.env, **options)
         except ModuleNotFoundError as error:
             raise ConfigError(f"task.env={self.env}: {missing(error)}") from error
+        except ImportError as error:  # an old one whose simulator is gone says so like this
+            raise ConfigError(f"task.env={self.env}: gymnasium cannot make it: {error}") from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"task.env={self.env}: gymnasium cannot make it: {error}") from error
-        options |= self._own_options(_keywords(type(probe.unwrapped)))
+        options |= self._own_options(_keywords(type(probe.unwrapped))) | {"max_episode_steps": self._horizon()}
         single = partial(make, self.env, **options)
         probe.close()
         try:
@@ -175,9 +184,19 @@ class ControlSettings(Settings):
         except Exception as error:  # whatever an environment makes of a value that it does not know
             raise ConfigError(f"task.options={self.options}: {self.env} says: {error}") from error
 
+    def _try(self, probe: gymnasium.Env[Any, Any]) -> None:
+        """One step. Raises `ConfigError` where the options' values are at odds with what the environment computes."""
+        try:
+            probe.reset(seed=0)
+            probe.step(probe.action_space.sample())
+        except Exception as error:  # whatever an environment makes of a value that it cannot compute with
+            raise ConfigError(f"task.options={self.options}: {self.env} cannot step with them: {error}") from error
+
     def _own_options(self, accepted: list[str]) -> dict[str, Any]:
         """The environment's own keyword arguments. Raises `ConfigError` for one that it does not have."""
         for name in self.options:
+            if name == "render_mode":
+                raise ConfigError("task.options: leave render_mode out; clips are drawn where a person asks for them")
             if name not in accepted:
                 raise ConfigError(f"task.options: {self.env} has no option {name!r}; {suggest(name, accepted)}")
         # An episode that ends early tells by its length how it was judged.

@@ -67,11 +67,12 @@ def _check_actions(space: Space[Any]) -> None:
 
 def _combinations(space: Space[Any]) -> int:
     """Of several choices; 0 for what are none."""
-    choices = _choices(space)
+    choices = choices_of(space)
     return math.prod(choices) if choices else 0
 
 
-def _choices(space: Space[Any]) -> tuple[int, ...]:
+def choices_of(space: Space[Any]) -> tuple[int, ...]:
+    """How many values each of several choices has; none for another space."""
     if isinstance(space, MultiDiscrete):
         return tuple(int(n) for n in space.nvec.ravel())
     return (2,) * math.prod(space.shape) if isinstance(space, MultiBinary) else ()
@@ -83,7 +84,7 @@ def _with_plain_actions(make: Make) -> gymnasium.Env[Any, Any]:
     if isinstance(space, Box):
         flat: Space[Any] = flatten_space(space)
         return TransformAction(env, lambda action: action.reshape(space.shape), flat)
-    choices, shape = _choices(space), space.shape
+    choices, shape = choices_of(space), space.shape
     start = space.start if isinstance(space, MultiDiscrete) else 0
 
     def taken_apart(choice: Any) -> np.ndarray:
@@ -95,4 +96,4 @@ def _with_plain_actions(make: Make) -> gymnasium.Env[Any, Any]:
     return TransformAction(env, taken_apart, Discrete(_combinations(space)))
 
 
-__all__ = ["MOST", "Make", "adapted"]
+__all__ = ["MOST", "Make", "adapted", "choices_of"]

@@ -102,7 +102,7 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(env.observation_space, num_envs)
         self.action_space = batch_space(env.action_space, num_envs)
         self._stepper = _stepper(name, env, num_envs, threads)
-        self._limit = max_episode_steps or gymnasium.registry[name].max_episode_steps
+        self._limit = _limit(name, max_episode_steps)
         # Not by health: these go on whatever falls.
         self._ends = terminate_when_unhealthy is not False
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
@@ -178,6 +178,15 @@ class FastVectorEnv(VectorEnv[Floats, np.ndarray, np.ndarray]):
             i = int(np.argwhere(wrong)[0][0])
             raise ValueError(f"the action of environment {i} is {given[i]}; expected one of {self.single_action_space}")
         return given.astype(space.dtype, copy=False)
+
+
+def _limit(name: str, asked: int | None) -> int | None:
+    """Steps of an episode; as gymnasium has it, -1 is no limit and None that of the registry."""
+    if asked is None:
+        return gymnasium.registry[name].max_episode_steps
+    if asked < 1 and asked != -1:
+        raise ValueError(f"max_episode_steps: expected at least 1, or -1 for no limit, got {asked}")
+    return None if asked == -1 else asked
 
 
 def _stepper(name: str, env: Any, count: int, threads: int) -> _Stepper:

@@ -388,7 +388,8 @@ def _explain(cls: type[Settings], error: ErrorDetails) -> str:
         tags = [tag.strip(" '") for tag in error["ctx"]["expected_tags"].split(",")]
         return f"{path}.kind: unknown kind {error['ctx']['tag']!r}; {suggest(error['ctx']['tag'], tags)}"
     if error["type"] == "missing":
-        return f"{path}: missing; expected a value"
+        about = group.model_fields[names[-1]].description if names[-1] in group.model_fields else None
+        return f"{path}: missing; expected a value" + (f": {' '.join(about.split())}" if about else "")
     if error["type"] == "value_error":
         inner = str(error["ctx"]["error"])
         return "\n".join(f"{path}{line if line[:1] in '.:' else ': ' + line}" for line in inner.splitlines())

@@ -700,8 +700,8 @@ class Settles(Protocol[C]):
     def settle(self, reward: RewardModel[C]) -> Evaluation[C] | None:
         """After an evaluation: None, or how the policy does that stands again."""
 
-    def go_back(self) -> int:
-        """Take up the best policy so far; returns the round that it is of."""
+    def go_back(self) -> int | None:
+        """Take up the best policy so far; returns the round that it is of, or None where no best one is kept."""
 
 
 @runtime_checkable

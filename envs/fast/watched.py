@@ -6,7 +6,10 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Timer
+
+from prefrl.components import resume_command
 
 TIMED_OUT = 124
 """The exit status of a process whose environment hung; that of `timeout`."""
@@ -40,7 +43,7 @@ def guarded(where: str, seconds: float | None) -> Iterator[None]:
 def _give_up(where: str, seconds: float) -> None:
     sys.stderr.write(
         f"error: {where} has not come back within {seconds:g} seconds (task.step_seconds). Finished rounds are in the "
-        "run's folder: go on with prefrl resume FOLDER\n"
+        f"run's folder: go on with {resume_command(Path('FOLDER'))}\n"
     )
     sys.stderr.flush()
     os._exit(TIMED_OUT)  # sys.exit would end this thread alone

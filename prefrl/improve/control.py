@@ -297,12 +297,12 @@ class ControlLearner:
             self.go_back()
         return undone
 
-    def go_back(self) -> int:
+    def go_back(self) -> int | None:
         best = self._player.best
-        if best.weights is not None:
-            # A copy: the optimiser goes on writing into what it is given.
-            self._take(deepcopy(best.weights))
-        return best.round if best.weights is not None else self._player.rounds
+        if best.weights is None:
+            return None
+        self._take(deepcopy(best.weights))  # a copy: the optimiser goes on writing into what it is given
+        return best.round
 
     def pace(self, begin: float, end: float) -> None:
         self._span = begin, end

@@ -22,7 +22,7 @@ from pydantic import Field, JsonValue
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from prefrl.components import ConfigError, Settings, missing
+from prefrl.components import ConfigError, Settings, missing, suggest
 from prefrl.improve.explore import explore
 from prefrl.improve.player import Player
 from prefrl.improve.replay import cut, load_replay, relabel, replay_state
@@ -103,7 +103,8 @@ class SB3Settings(Settings):
     options: dict[str, JsonValue] = Field(default_factory=dict)
     """Arguments of the algorithm (learning_rate, gamma, batch_size, ...), as its own documentation names them."""
     policy: dict[str, JsonValue] = Field(default_factory=dict)
-    """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64]."""
+    """stable-baselines3's `policy_kwargs`, such as net_arch: [64, 64] and activation_fn: relu (a class of torch.nn, in
+    whatever case). The class of policies is the algorithm's for rows of numbers, MlpPolicy or MlpLstmPolicy."""
     start: Path | None = None
     """A zip of the same algorithm, or a run with it, whose networks this one starts from; from the working directory
     where it is relative. It needs the same widths and spaces; optimisers and what is replayed begin anew."""
@@ -252,11 +253,12 @@ class SB3:
             self.go_back()
         return undone
 
-    def go_back(self) -> int:
+    def go_back(self) -> int | None:
         best = self._player.best
-        if best.weights is not None:
-            self._load_networks(deepcopy(best.weights))  # a copy: optimisers go on writing into what they are given
-        return best.round if best.weights is not None else self._player.rounds
+        if best.weights is None:
+            return None
+        self._load_networks(deepcopy(best.weights))  # a copy: optimisers go on writing into what they are given
+        return best.round
 
     def pace(self, begin: float, end: float) -> None:
         self._end = end
@@ -387,15 +389,28 @@ def _algorithm(settings: SB3Settings, env: VecEnv) -> Any:
     options = dict(settings.options)
     if not ALGORITHMS[settings.algorithm].replays:
         options.setdefault("n_steps", settings.at_once)
+    made, device = algorithm_class(settings.algorithm), device_of(settings.device)
+    network, kwargs = ALGORITHMS[settings.algorithm].policy, _network(settings.policy) or None
     try:
-        device = device_of(settings.device)
-        network, kwargs = ALGORITHMS[settings.algorithm].policy, dict(settings.policy) or None
-        return algorithm_class(settings.algorithm)(
-            network, env, policy_kwargs=kwargs, device=device, verbose=0, **options
-        )
-    except TypeError as error:  # an option that its constructor does not have
-        where = "policy" if "Policy" in str(error) else "options"  # it names whose constructor that was
-        raise ConfigError(f"learner.{where}: stable-baselines3's {settings.algorithm} says: {error}") from error
+        return made(network, env, policy_kwargs=kwargs, device=device, verbose=0, **options)
+    except (TypeError, ValueError, AssertionError) as error:  # what its constructor does not have, or cannot use
+        named = ("Policy", *settings.policy)  # whose constructor that was, or which argument
+        where = "policy" if any(name in str(error) for name in named) else "options"
+        said = error or "nothing; one of these has a value that it cannot use"
+        raise ConfigError(
+            f"learner.{where}={getattr(settings, where)}: stable-baselines3's {settings.algorithm} says: {said}"
+        ) from error
+
+
+def _network(policy: dict[str, JsonValue]) -> dict[str, Any]:
+    """`policy_kwargs`, with a class of torch.nn for the name of one."""
+    found: dict[str, Any] = dict(policy)
+    if isinstance(name := found.get("activation_fn"), str):
+        classes = {each.lower(): each for each in torch.nn.modules.activation.__all__}
+        if name.lower() not in classes:
+            raise ConfigError(f"learner.policy.activation_fn: {name!r} is none of torch.nn's; {suggest(name, classes)}")
+        found["activation_fn"] = getattr(torch.nn, classes[name.lower()])
+    return found
 
 
 def _check_steps(settings: SB3Settings) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from prefrl.envs.spaces import MOST, choices_of
 from prefrl.policies.rollout import Rollout
 from prefrl.protocols import ControlTask, StepRewards, Transition
 from prefrl.types import Floats
@@ -126,25 +128,45 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
 
 
 def flattened(space: gymnasium.Space[Any], observations: Seen) -> Floats:
-    """(N, O) float32 rows of N observations, in gymnasium's order: a dict's parts by name, a choice one-hot."""
+    """(N, O) float32 rows of N observations, in gymnasium's order: a dict's parts by name, each choice one-hot."""
     if isinstance(space, gymnasium.spaces.Dict):
         assert isinstance(observations, dict)
         return np.concatenate([flattened(part, observations[name]) for name, part in space.spaces.items()], 1)
     assert not isinstance(observations, dict)
     if isinstance(space, gymnasium.spaces.Discrete):
         return executed(space, observations)
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        chosen = _counted(space, observations)
+        each = [np.eye(n, dtype=np.float32)[chosen[:, i]] for i, n in enumerate(choices_of(space))]
+        return np.concatenate(each, 1)
     return np.asarray(observations, np.float32).reshape(len(observations), -1)
 
 
 def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
-    """Actions as a reward model sees them, (n, A) float32: clipped to a box's bounds, one-hot where discrete."""
+    """Actions as a reward model sees them, (n, A) float32: clipped to a box's bounds, one-hot where discrete, and of
+    several choices the combination, as a prefrl task has it."""
     if isinstance(space, gymnasium.spaces.Box):
         clipped: Floats = np.clip(actions, space.low, space.high).astype(np.float32)
         return clipped
     if isinstance(space, gymnasium.spaces.Discrete):
         chosen = np.asarray(actions).reshape(-1).astype(np.int64) - int(space.start)  # a Discrete may count from 1
         return np.eye(int(space.n), dtype=np.float32)[chosen]
-    raise ValueError(f"actions must be a Box or Discrete, got {space}")
+    choices = choices_of(space)
+    if not 0 < math.prod(choices) <= MOST or not choices:
+        raise ValueError(
+            "actions must be a Box, Discrete, or a MultiDiscrete or MultiBinary of at most "
+            f"{MOST} combinations, got {space}"
+        )
+    combination = np.ravel_multi_index(tuple(_counted(space, actions).T), choices)
+    found: Floats = np.eye(math.prod(choices), dtype=np.float32)[combination]
+    return found
+
+
+def _counted(space: gymnasium.Space[Any], values: np.ndarray) -> np.ndarray:
+    """(N, k) values of several choices, counted from 0."""
+    start = space.start.ravel() if isinstance(space, gymnasium.spaces.MultiDiscrete) else 0
+    found: np.ndarray = np.asarray(values).reshape(len(values), -1).astype(np.int64) - start
+    return found
 
 
 def _infos(step: Transition) -> list[dict[str, Any]]:

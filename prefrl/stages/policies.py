@@ -132,4 +132,9 @@ def _learner_of(folder: Path, best: bool) -> tuple[Any, Any, int]:
         return learner, task, json.loads((saved.folder / "loop.json").read_text())["round"]
     if not isinstance(learner, Settles):
         raise RunError(f"{folder}: its learner ({type(learner).__name__}) keeps no best policy beside the last one")
-    return learner, task, learner.go_back()
+    if (best_round := learner.go_back()) is None:
+        raise RunError(
+            f"{folder}: no best policy is kept beside the last one, since learner.rollback is null, or no fit was "
+            "followed by an evaluation yet; leave --best out, or set learner.rollback=0.1 in a new run"
+        )
+    return learner, task, best_round

@@ -48,6 +48,21 @@ def test_an_unknown_id_is_refused_with_the_nearest(wrong: str, right: str) -> No
         ControlSettings(env=wrong).build()
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"options": {"g": "x"}}, r"task\.options=.*Pendulum-v1 cannot step with them: unsupported operand"),
+        ({"options": {"render_mode": "human"}}, "leave render_mode out"),
+        ({"variable_horizon": True, "after_end": "restart"}, "episodes end, and nothing comes after"),
+        ({"env": "HalfCheetah-v3"}, "gymnasium cannot make it: The mujoco v2 and v3 based environments"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
+def test_what_could_not_be_stepped_is_refused_when_the_task_is_built(settings: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        ControlSettings(**settings).build()
+
+
 def test_an_id_cannot_name_code_to_import() -> None:
     with pytest.raises(ConfigError, match="unknown gymnasium environment"):
         ControlSettings(env="antigravity:Pendulum-v1").build()

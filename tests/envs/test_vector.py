@@ -124,3 +124,11 @@ def test_an_algorithm_learns_on_the_vec_env_behind_the_usual_wrappers() -> None:
     assert len(model.ep_info_buffer or []) > 2
     with pytest.raises(ValueError, match="autoreset_mode"):
         FastVecEnv("CartPole-v1", 2, autoreset_mode="NextStep")
+
+
+def test_minus_one_is_no_limit_and_nothing_else_below_one_is() -> None:
+    envs = gymnasium.make_vec("prefrl/MountainCar-v0", 1, max_episode_steps=-1)
+    envs.reset(seed=0)
+    assert not any(envs.step(np.array([1]))[3].any() for _ in range(250))  # its own limit is 200
+    with pytest.raises(ValueError, match="expected at least 1, or -1 for no limit, got 0"):
+        gymnasium.make_vec("prefrl/Pendulum-v1", 1, max_episode_steps=0)

@@ -162,6 +162,13 @@ def test_a_learner_that_keeps_none_has_no_best_policy(tmp_path: Path, monkeypatc
         evaluate(tmp_path / "run", best=True)
 
 
+def test_where_nothing_is_rolled_back_no_best_policy_is_passed_off(tmp_path: Path) -> None:
+    with Run(shrink(Config.load("control/toy", ["learner.rollback=null"])), tmp_path / "run") as run:
+        list(run)
+    with pytest.raises(RunError, match=r"no best policy is kept .*learner\.rollback is null"):
+        evaluate(tmp_path / "run", best=True)
+
+
 class Ruined(ControlLearner):
     """Goes wrong in the last round."""
 

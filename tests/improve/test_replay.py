@@ -6,11 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 from control_stubs import Ageing, Known
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from prefrl.improve import replay
 from prefrl.improve.replay import cut, relabel
+from prefrl.improve.vec_env import executed, flattened
 
 LINE = Box(-99.0, 99.0, (1,))
 UNIT = Box(-1.0, 1.0, (1,))
@@ -114,3 +115,16 @@ def test_a_ring_that_is_scored_in_pieces_is_scored_as_a_whole(steps: int, monkey
         rewards.append(buffer.rewards[: buffer.size()].tolist())
     assert rewards[0] == rewards[1] == rewards[2]
     assert max(rewards[0]) == [4.0, 4.0]
+
+
+def test_several_choices_are_seen_as_gymnasium_and_a_task_see_them() -> None:
+    space = Dict({"hands": MultiDiscrete([2, 3], start=[1, 0]), "lamps": MultiBinary(2)})
+    space.seed(0)
+    rows = [space.sample() for _ in range(20)]
+    seen = {name: np.stack([row[name] for row in rows]) for name in space}
+    np.testing.assert_array_equal(flattened(space, seen), [gymnasium.spaces.flatten(space, row) for row in rows])
+    hands, lamps = (executed(space[name], seen[name]).argmax(1) for name in space)
+    np.testing.assert_array_equal(hands, 3 * (seen["hands"][:, 0] - 1) + seen["hands"][:, 1])
+    np.testing.assert_array_equal(lamps, 2 * seen["lamps"][:, 0] + seen["lamps"][:, 1])
+    with pytest.raises(ValueError, match="at most 1024 combinations, got MultiBinary"):
+        executed(MultiBinary(11), np.zeros((1, 11)))

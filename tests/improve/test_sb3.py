@@ -289,6 +289,28 @@ def test_an_option_that_the_algorithm_does_not_have_is_refused_by_name() -> None
         _learner(point(), {"algorithm": "PPO", "options": {"learning_rat": 1.0}})
 
 
+FITS = {"batch_size": 40}  # stable-baselines3 warns of one that does not divide the rollout
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"options": FITS | {"learning_rate": "fast"}}, r"learner\.options=.*schedule must be a float or a callable"),
+        ({"options": {"n_steps": 1, "batch_size": 1}}, r"learner\.options=.*`batch_size` must be greater than 1"),
+        ({"options": FITS, "policy": {"squash_output": True}}, r"learner\.policy=.*only available when using gSDE"),
+        ({"policy": {"activation_fn": "rellu"}}, r"activation_fn: 'rellu' is none of torch\.nn's; did you mean 'relu'"),
+    ],
+)
+def test_a_value_that_the_algorithm_cannot_use_is_refused_with_what_it_says(settings: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        _learner(point(), {"algorithm": "PPO"} | settings)
+
+
+def test_a_networks_activation_is_set_by_name() -> None:
+    learner = _learner(point(), {"algorithm": "SAC", "policy": {"net_arch": [4], "activation_fn": "gelu"}})
+    assert isinstance(learner.model.actor.latent_pi[1], torch.nn.GELU)
+
+
 def test_the_algorithm_is_stable_baselines3s_own() -> None:
     assert isinstance(_learner(point(), SAC_).model, SAC)
 
@@ -383,7 +405,7 @@ def test_without_rollback_the_last_policy_stands(store: Store[Segment]) -> None:
             _all(learner, 10.0)
         learner.evaluate(Known(), np.random.default_rng(1))
         assert learner.settle(Known()) is None
-    assert learner.go_back() == 2
+    assert learner.go_back() is None
 
 
 def test_exploration_falls_over_the_run_and_not_in_each_round_anew(store: Store[Segment], tmp_path: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from prefrl import Config, Run
+from prefrl.components import PLUGINS
 from prefrl.envs.fast.watched import TIMED_OUT, EnvironmentFault, guarded
 from prefrl.envs.fast.wrapped import Wrapped
 from prefrl.policies.rollout import collect
@@ -91,8 +93,10 @@ def test_an_environment_that_hangs_ends_the_process_and_says_which(tmp_path: Pat
         "import time; from prefrl.envs.fast.watched import guarded\n"
         "with guarded('environment 1, step 3 of its episode', 0.2): time.sleep(60)\n"
     )
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30)
+    known = os.environ | {PLUGINS: "mine.py"}
+    ended = subprocess.run([sys.executable, "-c", script], env=known, capture_output=True, text=True, timeout=30)
     assert ended.returncode == TIMED_OUT
+    assert "go on with prefrl --plugin mine.py resume FOLDER" in ended.stderr
     assert "environment 1, step 3 of its episode has not come back within 0.2 seconds" in ended.stderr
     with guarded("what is quick enough", 30.0):
         pass
