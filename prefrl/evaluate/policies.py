@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -31,9 +32,8 @@ def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]
     """Over the first episode of each row: mean `gold`, `learned` and `length`, `gold_std`, and their `count`."""
     gold, learned, lengths = returns(rollout, reward)
     shown = max(1, round(EXAMPLE_SECONDS * task.fps))
-    examples = [
-        segment(rollout, i, 0, min(int(lengths[i]), shown), "evaluation") for i in range(min(EXAMPLES, len(gold)))
-    ]
+    openings = (segment(rollout, i, 0, min(int(length), shown), "evaluation") for i, length in enumerate(lengths))
+    examples = list(islice(unlike(openings), EXAMPLES))
     whole = tuple(segment(rollout, i, 0, int(length), "evaluation") for i, length in enumerate(lengths))
     metrics = {
         "count": float(len(gold)),
@@ -45,6 +45,16 @@ def evaluation(task: ControlTask, rollout: Rollout, reward: RewardModel[Segment]
     if isinstance(task, Mixed):
         metrics |= _by_task(task, rollout, gold)
     return Evaluation(metrics, tuple(placed(task, examples)), candidates=tuple(placed(task, whole)))
+
+
+def unlike(segments: Iterable[Segment]) -> Iterator[Segment]:
+    """The segments without those that show what an earlier one does: where nothing is drawn, all episodes are alike."""
+    seen = set()
+    for one in segments:
+        shown = one.observations.tobytes(), one.actions.tobytes()
+        if shown not in seen:
+            seen.add(shown)
+            yield one
 
 
 def _by_task(task: Mixed, rollout: Rollout, gold: Floats) -> Metrics:

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from prefrl.kinds import kind_of
-from prefrl.protocols import DrawnTask, Task
+from prefrl.protocols import Clocked, DrawnTask, Task
 from prefrl.storage.files import write_file
 from prefrl.types import Candidate, Floats, Json, gold_score
 
@@ -80,8 +80,8 @@ def _show(task: Task, candidate: Candidate, place: Path, file: str) -> Json:
 
 
 def _caption(task: DrawnTask[Any], steps: int) -> str:
-    seconds = steps / task.fps
-    return f"{steps} steps, {seconds:.1f} s of simulated time, from left to right"
+    time = f", {steps / task.fps:.1f} s of simulated time" if isinstance(task, Clocked) else ""
+    return f"{steps} steps{time}, from left to right"
 
 
 def save_strip(picture: np.ndarray, path: Path) -> None:

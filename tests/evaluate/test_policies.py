@@ -38,6 +38,16 @@ def test_an_evaluation_counts_the_last_step_of_an_episode() -> None:
     assert metrics["gold"] == pytest.approx(rollout.gold.sum(1).mean())
 
 
+def test_episodes_that_are_all_alike_are_shown_once() -> None:
+    task = _task()
+    act = lambda o, legal, begins: (o[:, :1],) * 2  # noqa: E731
+    rollout = whole_episodes(task, act, 5, np.random.default_rng(0))
+    rollout.observations[:3], rollout.actions[:3] = rollout.observations[0], rollout.actions[0]
+    found = evaluation(task, rollout, MLPSettings(hidden=(4,)).build(task, np.random.default_rng(0)))
+    assert [one.episode for one in found.examples] == ["evaluation/0/0", "evaluation/3/0", "evaluation/4/0"]
+    assert len(found.candidates) == 5
+
+
 def test_self_bleu_is_what_it_is_worked_out_to_be_by_hand() -> None:
     texts = [text.split() for text in ("the cat sat", "the cat ran", "a dog sat down")]
     first = (3 / 3 * 1 / 2 * 0.1 / 1) ** (1 / 3)  # "the cat" is also in the second, and no run of three anywhere

@@ -34,6 +34,13 @@ class Drawn:
         return np.broadcast_to(shades[:, None, None, None], (len(segment), self.size, self.size, 3))
 
 
+@dataclass(frozen=True)
+class Moving(Drawn):
+    """One whose steps take time."""
+
+    steps_per_second: float = 20.0
+
+
 def segment(start: int = 0, gold: float | None = 1.0) -> Segment:
     zeros = np.zeros((30, 2), np.float32)
     return Segment(zeros, zeros, "e", start, gold=None if gold is None else np.full(30, gold))
@@ -52,7 +59,7 @@ def test_a_short_clip_repeats_no_frame() -> None:
 
 
 def test_segments_are_kept_as_strips_that_a_report_can_read(tmp_path: Path) -> None:
-    path = save_examples(Drawn(size=320), [segment(0), segment(30, None)], np.array([0.5, 2.0]), tmp_path, "before")
+    path = save_examples(Moving(size=320), [segment(0), segment(30, None)], np.array([0.5, 2.0]), tmp_path, "before")
     entries = json.loads(path.read_text())
     assert [e["gold"] for e in entries] == [30.0, None]
     assert entries[0]["caption"] == "30 steps, 1.5 s of simulated time, from left to right"
@@ -62,6 +69,11 @@ def test_segments_are_kept_as_strips_that_a_report_can_read(tmp_path: Path) -> N
     with Image.open(path.parent / entries[0]["film"]) as film:
         assert (getattr(film, "n_frames"), film.height) == (15, 160)  # noqa: B009 - every second frame
     assert [e.film[:23] for e in read(tmp_path).before] == ["data:image/webp;base64,"] * 2
+
+
+def test_of_steps_that_take_no_time_no_seconds_are_told(tmp_path: Path) -> None:
+    path = save_examples(Drawn(), [segment()], None, tmp_path, "before")
+    assert json.loads(path.read_text())[0]["caption"] == "30 steps, from left to right"
 
 
 def test_a_renderer_that_fails_leaves_a_caption(tmp_path: Path) -> None:
