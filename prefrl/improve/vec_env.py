@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from prefrl.policies.rollout import Rollout
+from prefrl.policies.rollout import Rollout, check_begun, stepped
 from prefrl.protocols import ControlTask, StepRewards, Transition
 from prefrl.types import Floats
 
@@ -16,7 +16,8 @@ from prefrl.types import Floats
 class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped here
     """A control task's environments as a stable-baselines3 `VecEnv`. Rewards are the gold: wrap it in `LearnedReward`.
 
-    It keeps what happened since the last `start`, for segments to be cut from.
+    It keeps what happened since the last `start`, for segments to be cut from. Raises FloatingPointError, which names
+    the environment and the step, where an observation or an action is not finite.
     """
 
     def __init__(self, task: ControlTask, count: int) -> None:
@@ -38,6 +39,7 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
 
     def reset(self) -> Floats:
         self._last = self.envs.reset(self._rng)
+        check_begun(self._last)
         return self._last
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -46,7 +48,8 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
 
     def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
         states = self.envs.states()  # before the step, as a segment pairs each state with the action taken in it
-        step = self.envs.step(self._actions)
+        # Checked here: an algorithm that has learned from a number that is none may go on without a word.
+        step = stepped(self.envs, self._last, self._actions, len(self._rows))
         # A copy: some simulators go on writing into the array that they gave out.
         self._rows.append((self._last, self._actions, None if states is None else states.copy(), step))
         self._last, self.steps = step.observations, self.steps + self.num_envs
