@@ -136,6 +136,7 @@ class ControlSettings(Settings):
             notes=notes,
             options=self.options,
             outside=OwnSpaces(probe.observation_space, probe.action_space, self.hide, self.stack),
+            variable_horizon=self.variable_horizon,
         )
 
     def _stepper(self, name: str, single: Make, horizon: int, after: AfterEnd) -> Callable[..., Environments]:
@@ -248,6 +249,8 @@ class GymnasiumTask:
     """The environment's keyword arguments, for drawing."""
     outside: OwnSpaces | None = None
     """What the environment itself shows and takes."""
+    variable_horizon: bool = False
+    """Whether episodes may end early."""
 
     @property
     def kind(self) -> str:

@@ -212,11 +212,15 @@ class Outside(Protocol):
 
 @runtime_checkable
 class OfEnvironment(Protocol):
-    """A task of control whose environment may have spaces of its own."""
+    """A task of control whose environment may have spaces, and ends of episodes, of its own."""
 
     @property
     def outside(self) -> Outside | None:
         """None where they are the task's."""
+
+    @property
+    def variable_horizon(self) -> bool:
+        """Whether it was told to let episodes end early."""
 
 
 @runtime_checkable
