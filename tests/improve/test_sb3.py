@@ -35,7 +35,7 @@ from prefrl.improve.sb3 import (
     executed,
     relabel,
 )
-from prefrl.policies.rollout import check_begun, learned_rewards
+from prefrl.policies.rollout import learned_rewards
 from prefrl.protocols import Environments, Transition
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
@@ -256,23 +256,23 @@ def test_discrete_actions_are_seen_one_hot_from_any_start() -> None:
     assert executed(gymnasium.spaces.Discrete(3, start=5), np.array([5, 7])).tolist() == [[1, 0, 0], [0, 0, 1]]
 
 
-def _diverging(discrete: bool, at: int) -> GymnasiumTask:
+def _diverging(discrete: bool, at: int, starts: tuple[float, ...] = ()) -> GymnasiumTask:
     """The point, of which one observation is no number: the `at`-th that a step leads to, of the second environment."""
     task = point(discrete=discrete)
 
     def make(count: int) -> Environments:
-        inner = task.make(count)
-        return Diverging(inner, at)
+        return Diverging(task.make(count), at, starts)
 
     return replace(task, make=make)
 
 
 class Diverging:
-    def __init__(self, inner: Environments, at: int) -> None:
-        self._inner, self._left = inner, at
+    def __init__(self, inner: Environments, at: int, starts: tuple[float, ...]) -> None:
+        self._inner, self._left, self._starts = inner, at, starts
 
     def reset(self, rng: np.random.Generator) -> Floats:
-        return self._inner.reset(rng)
+        first = self._inner.reset(rng)
+        return np.array(self._starts, np.float32)[:, None] if self._starts else first
 
     def states(self) -> Floats | None:
         return None
@@ -308,8 +308,9 @@ def test_what_an_algorithm_does_and_what_an_episode_begins_with_are_numbers_too(
     env.step(np.zeros((2, 1), np.float32))
     with pytest.raises(FloatingPointError, match="action of environment 1 in step 1 of the rollout is"):
         env.step(np.array([[0.5], [np.nan]], np.float32))
+    env = TaskEnv(_diverging(discrete=False, at=99, starts=(0.0, np.inf)), 2)
     with pytest.raises(FloatingPointError, match="first observation of an episode of environment 1"):
-        check_begun(np.array([[0.0], [np.inf]], np.float32))
+        env.reset()
 
 
 @both
