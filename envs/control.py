@@ -21,7 +21,7 @@ from prefrl.envs.fast.retold import Retell, retelling
 from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.envs.fast.wrapped import AfterEnd, Wrapped, is_mujoco, make
 from prefrl.envs.partial import Partial
-from prefrl.envs.spaces import Make, adapted
+from prefrl.envs.spaces import Make, OwnSpaces, adapted
 from prefrl.protocols import Dynamics, Environments
 from prefrl.types import Floats, Segment
 
@@ -142,6 +142,8 @@ class ControlSettings(Settings):
             retell=retell,
             notes=notes,
             options=self.options,
+            outside=OwnSpaces(probe.observation_space, probe.action_space, self.hide, self.stack),
+            variable_horizon=self.variable_horizon,
         )
 
     def _stepper(self, name: str, single: Make, horizon: int, after: AfterEnd) -> Callable[..., Environments]:
@@ -264,6 +266,10 @@ class GymnasiumTask:
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     """The environment's keyword arguments, for drawing."""
+    outside: OwnSpaces | None = None
+    """What the environment itself shows and takes."""
+    variable_horizon: bool = False
+    """Whether episodes may end early."""
 
     @property
     def kind(self) -> str:

@@ -191,6 +191,38 @@ class Parted(Protocol):
         """
 
 
+class Outside(Protocol):
+    """What an environment itself shows and takes, for a policy that acts in it without its task."""
+
+    @property
+    def changed(self) -> Sequence[str]:
+        """In words, what is not as the policy has it: a row of numbers in, a row of numbers or a choice from 0 out."""
+
+    @property
+    def shown(self) -> str:
+        """In words, what the policy sees of an observation; empty where it sees just that."""
+
+    def rows(self, observations: Any) -> tuple[Floats, bool]:
+        """One observation, or n as a vectorised environment gives them -> (n, O) what the policy sees, and whether it
+        was one. Raises ValueError for what is no observation of the environment."""
+
+    def taken(self, actions: Floats) -> np.ndarray:
+        """(n, A) what the policy does -> (n, ...) what the environment takes."""
+
+
+@runtime_checkable
+class OfEnvironment(Protocol):
+    """A task of control whose environment may have spaces, and ends of episodes, of its own."""
+
+    @property
+    def outside(self) -> Outside | None:
+        """None where they are the task's."""
+
+    @property
+    def variable_horizon(self) -> bool:
+        """Whether it was told to let episodes end early."""
+
+
 @runtime_checkable
 class Mixed(Protocol):
     """A task of control that is several, of which each episode is of one."""

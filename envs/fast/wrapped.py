@@ -21,9 +21,10 @@ AfterEnd: TypeAlias = Literal["absorb", "restart", "end"]
 class Wrapped:
     """n gymnasium environments stepped in a loop; implements `prefrl.protocols.Environments`.
 
-    `build` makes one, its time limit included. An episode that the environment ends goes on to its horizon, or its
-    length would tell the reward model and the policy how it was judged: where it ended, with a reward of 0 a step
-    (`absorb`, as in seals), or from a fresh start, of which the learner is not told (`restart`). `end` lets it end.
+    `build` makes one, its time limit included. An episode that the environment ends, also by a limit of its own, goes
+    on to its horizon, or its length would tell the reward model and the policy how it was judged: where it ended, with
+    a reward of 0 a step (`absorb`, as in seals), or from a fresh start, of which the learner is not told (`restart`).
+    `end` lets it end.
 
     Raises `EnvironmentFault`, which names the environment and its step, where one raises, gives an observation of
     another shape or type than its first, or a reward that is not finite. A call that takes longer than `step_seconds`
@@ -64,6 +65,9 @@ class Wrapped:
         terminated, truncated = np.zeros(len(actions), bool), np.zeros(len(actions), bool)
         for i in np.flatnonzero(~self._over).tolist():
             final[i], rewards[i], terminated[i], truncated[i] = self._step(i, actions[i])
+            if self._after != "end" and self._elapsed[i] + 1 < self._horizon:
+                # Time that is up too soon would shorten the episode as any other end of the environment's own would.
+                terminated[i] |= truncated[i]
             if terminated[i] and self._after == "restart":
                 final[i] = self._reset(i)  # without a seed: the generator that `reset` seeded goes on
         if not np.isfinite(rewards).all():
@@ -73,7 +77,7 @@ class Wrapped:
         if self._after == "absorb":
             self._over |= terminated
         if self._after != "end":
-            terminated[:], truncated = False, truncated | (self._elapsed >= self._horizon)
+            terminated[:], truncated = False, self._elapsed >= self._horizon
         ended = terminated | truncated
         self._last = final.copy()  # a reset must not change what the step led to
         for i in np.flatnonzero(ended).tolist():

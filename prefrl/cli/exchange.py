@@ -128,9 +128,10 @@ def _export_model(source: Path, to: Path, form: Form, best: bool) -> str:
     elif form is Form.sb3:
         round = stages.export_sb3(source, to, best)
         said = f"the policy after round {round}; stable-baselines3 loads it, and it acts on raw observations"
+        said += stages.shown_of(source)
     elif form is Form.onnx:
         stages.export_onnx(source, to, best)
-        said = "raw observations (n, O) in, actions out: the policy's mode"
+        said = f"raw observations (n, O){stages.shown_of(source)} in, actions out: the policy's mode"
     else:
         stages.policy_of(source).save(to, adapter=form is Form.adapter)
         loads = "PeftModel.from_pretrained" if form is Form.adapter else "AutoModelForCausalLM.from_pretrained"

@@ -19,6 +19,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.improve.player import Player
 from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.divided import environments
+from prefrl.policies.loaded import check_leaves
 from prefrl.policies.rollout import Act, Rollout, collect, learned_rewards, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device
@@ -120,7 +121,11 @@ class QLearning:
         return act
 
     def save(self, path: Path) -> None:
-        """As DQN of stable-baselines3 without a hidden layer: its only weights are the table."""
+        """As DQN of stable-baselines3 without a hidden layer: its only weights are the table.
+
+        Raises `ConfigError` as `check_leaves` does.
+        """
+        check_leaves(self._task)
         from stable_baselines3 import DQN
 
         from prefrl.improve.vec_env import TaskEnv

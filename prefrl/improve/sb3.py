@@ -29,6 +29,7 @@ from prefrl.improve.replay import cut, load_replay, relabel, replay_state
 from prefrl.improve.sb3_start import take_over
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
 from prefrl.policies.acting import Actor, Memory, played
+from prefrl.policies.loaded import check_leaves
 from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
@@ -270,7 +271,8 @@ class SB3:
         return act
 
     def save(self, path: Path) -> None:
-        """As stable-baselines3 saves it: `SAC.load` and its like read it."""
+        """As stable-baselines3 saves it: `SAC.load` and its like read it. Raises as `check_leaves` does."""
+        check_leaves(self._task)
         self.model.save(path)
 
     def state(self) -> State:

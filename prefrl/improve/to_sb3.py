@@ -14,6 +14,7 @@ from torch import Tensor
 
 from prefrl.components import ConfigError
 from prefrl.improve.vec_env import TaskEnv
+from prefrl.policies.loaded import check_leaves
 from prefrl.policies.mlp import MLPPolicy
 from prefrl.protocols import ControlTask
 from prefrl.seeding import to_numpy
@@ -27,7 +28,9 @@ def save_ppo(policy: MLPPolicy, task: ControlTask, path: Path) -> None:
 
     The observation's normaliser is folded into the first layers and the bounds' box into the actor's last, since PPO
     has neither. Two things are lost: our clip of observations at 10 standard deviations, and Adam's moments.
+    Raises `ConfigError` for an environment that gives or takes other things than PPO would (`check_leaves`).
     """
+    check_leaves(task)
     widths = {"pi": list(policy.widths["actor"]), "vf": list(policy.widths["critic"])}
     settings: dict[str, Any] = {"net_arch": widths, "activation_fn": ACTIVATIONS[policy.settings.activation]}
     if policy.space.squash:

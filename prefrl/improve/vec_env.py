@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from prefrl.envs.spaces import MOST, choices_of
-from prefrl.policies.rollout import Rollout
+from prefrl.envs.spaces import MOST, choices_of, combinations, counted, numbers_of
+from prefrl.policies.rollout import Rollout, check_begun, stepped
 from prefrl.protocols import ControlTask, StepRewards, Transition
 from prefrl.types import Floats
 
@@ -18,7 +17,8 @@ from prefrl.types import Floats
 class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped here
     """A control task's environments as a stable-baselines3 `VecEnv`. Rewards are the gold: wrap it in `LearnedReward`.
 
-    It keeps what happened since the last `start`, for segments to be cut from.
+    It keeps what happened since the last `start`, for segments to be cut from. Raises FloatingPointError, which names
+    the environment and the step, where an observation or an action is not finite.
     """
 
     def __init__(self, task: ControlTask, count: int) -> None:
@@ -40,6 +40,7 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
 
     def reset(self) -> Floats:
         self._last = self.envs.reset(self._rng)
+        check_begun(self._last)
         return self._last
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -48,7 +49,8 @@ class TaskEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 is untyped her
 
     def step_wait(self) -> tuple[Floats, Floats, np.ndarray, list[dict[str, Any]]]:
         states = self.envs.states()  # before the step, as a segment pairs each state with the action taken in it
-        step = self.envs.step(self._actions)
+        # Checked here: an algorithm that has learned from a number that is none may go on without a word.
+        step = stepped(self.envs, self._last, self._actions, len(self._rows))
         # A copy: some simulators go on writing into the array that they gave out.
         self._rows.append((self._last, self._actions, None if states is None else states.copy(), step))
         self._last, self.steps = step.observations, self.steps + self.num_envs
@@ -136,7 +138,7 @@ def flattened(space: gymnasium.Space[Any], observations: Seen) -> Floats:
     if isinstance(space, gymnasium.spaces.Discrete):
         return executed(space, observations)
     if isinstance(space, gymnasium.spaces.MultiDiscrete):
-        chosen = _counted(space, observations)
+        chosen = counted(space, observations)
         each = [np.eye(n, dtype=np.float32)[chosen[:, i]] for i, n in enumerate(choices_of(space))]
         return np.concatenate(each, 1)
     return np.asarray(observations, np.float32).reshape(len(observations), -1)
@@ -151,21 +153,12 @@ def executed(space: gymnasium.Space[Any], actions: np.ndarray) -> Floats:
     if isinstance(space, gymnasium.spaces.Discrete):
         chosen = np.asarray(actions).reshape(-1).astype(np.int64) - int(space.start)  # a Discrete may count from 1
         return np.eye(int(space.n), dtype=np.float32)[chosen]
-    choices = choices_of(space)
-    if not 0 < math.prod(choices) <= MOST or not choices:
+    if not 0 < combinations(space) <= MOST:
         raise ValueError(
             "actions must be a Box, Discrete, or a MultiDiscrete or MultiBinary of at most "
             f"{MOST} combinations, got {space}"
         )
-    combination = np.ravel_multi_index(tuple(_counted(space, actions).T), choices)
-    found: Floats = np.eye(math.prod(choices), dtype=np.float32)[combination]
-    return found
-
-
-def _counted(space: gymnasium.Space[Any], values: np.ndarray) -> np.ndarray:
-    """(N, k) values of several choices, counted from 0."""
-    start = space.start.ravel() if isinstance(space, gymnasium.spaces.MultiDiscrete) else 0
-    found: np.ndarray = np.asarray(values).reshape(len(values), -1).astype(np.int64) - start
+    found: Floats = np.eye(combinations(space), dtype=np.float32)[numbers_of(space, actions)]
     return found
 
 

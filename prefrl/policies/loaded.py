@@ -11,7 +11,8 @@ import numpy.typing as npt
 from prefrl.components import ConfigError
 from prefrl.policies.acting import Actor, Memory, forgotten, played
 from prefrl.policies.rollout import Act
-from prefrl.protocols import ControlTask
+from prefrl.protocols import ControlTask, OfEnvironment, Outside, Task
+from prefrl.types import Floats
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class Loaded:
     observation_size: int
     action_size: int
     discrete: bool
+    outside: Outside | None = None
+    """What the environment itself shows and takes; None where that is what the policy sees and does."""
 
     def act(self, rng: np.random.Generator | None) -> Act:
         """For rollouts: what is drawn from `rng`, or the policy's mode; in episodes that are yet to begin."""
@@ -39,34 +42,61 @@ class Loaded:
 
     def predict(
         self,
-        observation: npt.ArrayLike,
+        observation: Any,
         state: Memory = None,
         episode_start: npt.ArrayLike | None = None,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[npt.NDArray[Any], Memory]:
-        """(O,) or (n, O) raw observations -> actions (A,) or (n, A), whole numbers where they are discrete.
+        """Observations as the environment gives them, one or n -> actions as it takes them, one or n.
 
+        (O,) or (n, O) raw observations give (A,) or (n, A) numbers, or whole numbers where actions are discrete; an
+        environment with other spaces gives and takes what it has, n of them as a vectorised environment stacks them.
         And what the policy remembers, to be passed on as the next call's `state`; None of one without a memory.
         `episode_start` (n,): for whom nothing before counts. `rng`: what is drawn from where the policy is not
-        `deterministic`. Raises ValueError for observations of another size.
+        `deterministic`. Raises ValueError for other observations.
         """
-        rows = np.atleast_2d(np.asarray(observation, np.float32))
+        rows, one = plain_rows(observation) if self.outside is None else self.outside.rows(observation)
         if rows.ndim != 2 or rows.shape[1] != self.observation_size:
-            shape = np.shape(observation)
-            raise ValueError(
-                f"observations must be ({self.observation_size},) or (n, {self.observation_size}), got {shape}"
-            )
+            size, shape = self.observation_size, np.shape(observation)
+            seen = f" ({self.outside.shown})" if self.outside is not None and self.outside.shown else ""
+            raise ValueError(f"observations must be ({size},) or (n, {size}){seen}, got {shape}")
         drawn = None if deterministic else rng or np.random.default_rng()
         if episode_start is not None:
             state = forgotten(state, np.atleast_1d(np.asarray(episode_start, bool)))
         actions, state = self.actor(rows, drawn, state)
-        found = actions.argmax(1) if self.discrete else actions
-        return (found[0] if np.ndim(observation) == 1 else found), state
+        if self.outside is not None:
+            found = self.outside.taken(actions)
+        else:
+            found = actions.argmax(1) if self.discrete else actions
+        return (found[0] if one else found), state
+
+
+def plain_rows(observations: Any) -> tuple[Floats, bool]:
+    """(O,) or (n, O) numbers -> (n, O), and whether it was one."""
+    return np.atleast_2d(np.asarray(observations, np.float32)), np.ndim(observations) == 1
+
+
+def outside(task: Task) -> Outside | None:
+    """What a task's environment itself shows and takes, where that may be something else."""
+    return task.outside if isinstance(task, OfEnvironment) else None
+
+
+def check_leaves(task: ControlTask) -> None:
+    """Raises `ConfigError` for a task whose policy would do, without its task, what the environment does not take.
+
+    For files that hold nothing but the policy: `Loaded` translates.
+    """
+    found = outside(task)
+    if found is not None and found.changed:
+        raise ConfigError(
+            f"a policy of {task.name} cannot leave in a file of another tool, which would not know what to do there: "
+            f"{'; '.join(found.changed)}. Act with it through prefrl.load_policy, which translates"
+        )
 
 
 def _told(seen: int, acts: int, discrete: bool) -> str:
     return f"observations of {seen} numbers and {acts} {'discrete actions' if discrete else 'numbers in an action'}"
 
 
-__all__ = ["Actor", "Loaded"]
+__all__ = ["Actor", "Loaded", "check_leaves", "outside", "plain_rows"]

@@ -11,7 +11,7 @@ import numpy as np
 from prefrl.components import ConfigError
 from prefrl.distributed import world
 from prefrl.policies.divided import Divided, environments
-from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel
+from prefrl.protocols import ControlTask, Environments, RewardModel, StepRewardModel, Transition
 from prefrl.types import Bools, Floats, Segment, State
 
 Act: TypeAlias = Callable[[Floats, Bools | None, Bools], tuple[Floats, Floats]]
@@ -91,23 +91,15 @@ def _collect(
 ) -> tuple[Rollout, Floats]:
     rows = []
     begins = np.ones(len(observations), bool) if begins is None else begins
+    check_begun(observations)
     for t in range(steps):
         # Before the step: a segment shows the state in which each action was taken. A copy: some simulators go on
         # writing into the array that they gave out.
         now, legal = envs.states(), envs.legal()
         states = None if now is None else now.copy()
         choices, actions = act(observations, legal, begins)
-        if not np.isfinite(actions).all():
-            env = int(np.argwhere(~np.isfinite(actions))[0][0])
-            raise FloatingPointError(
-                f"the action of environment {env} in step {t} of the rollout is {actions[env]}, at observation "
-                f"{observations[env]}; the policy's weights are no longer finite"
-            )
-        step = envs.step(actions)
+        step = stepped(envs, observations, actions, t)
         rows.append((observations, choices, actions, step, states, legal))
-        # The final ones: a reset in the same step would hide a simulation that went to infinity.
-        if not np.isfinite(step.final_observations).all():
-            raise FloatingPointError(_not_finite(step.final_observations, actions, t))
         observations, begins = step.observations, step.terminated | step.truncated
     steps_ = [row[3] for row in rows]
     rollout = Rollout(
@@ -122,6 +114,42 @@ def _collect(
         legal=None if rows[0][5] is None else np.stack([cast(Bools, row[5]) for row in rows], 1),
     )
     return rollout, observations
+
+
+def stepped(envs: Environments, observations: Floats, actions: Floats, t: int) -> Transition:
+    """Step `t` of a rollout, from `observations` (n, O) with `actions` (n, A).
+
+    Raises FloatingPointError, which names the environment and the step, where an action or an observation that follows
+    is not finite.
+    """
+    if not np.isfinite(actions).all():
+        env = _first_bad(actions)
+        raise FloatingPointError(
+            f"the action of environment {env} in step {t} of the rollout is {actions[env]}, at observation "
+            f"{observations[env]}; the policy's weights are no longer finite"
+        )
+    step = envs.step(actions)
+    # The final ones: a reset in the same step would hide a simulation that went to infinity.
+    if not np.isfinite(step.final_observations).all():
+        env = _first_bad(step.final_observations)
+        raise FloatingPointError(
+            f"the observation of environment {env} after step {t} of the rollout is not finite: "
+            f"{step.final_observations[env]}, after action {actions[env]}; the simulation diverged, or the environment "
+            "is at fault"
+        )
+    if (step.terminated | step.truncated).any():  # elsewhere they are the final ones
+        check_begun(step.observations)
+    return step
+
+
+def check_begun(observations: Floats) -> None:
+    """Raises FloatingPointError where an observation (n, O) that an episode begins with is not finite."""
+    if not np.isfinite(observations).all():
+        env = _first_bad(observations)
+        raise FloatingPointError(
+            f"the first observation of an episode of environment {env} is not finite: {observations[env]}; the "
+            "environment is at fault"
+        )
 
 
 def learned_rewards(reward: StepRewardModel, rollout: Rollout) -> Floats:
@@ -166,9 +194,6 @@ def step_rewards(reward: RewardModel[Segment]) -> StepRewardModel:
     return reward
 
 
-def _not_finite(observations: Floats, actions: Floats, t: int) -> str:
-    env = int(np.argwhere(~np.isfinite(observations))[0][0])
-    return (
-        f"the observation of environment {env} after step {t} of the rollout is not finite: {observations[env]}, after "
-        f"action {actions[env]}; the simulation diverged, or the environment is at fault"
-    )
+def _first_bad(rows: Floats) -> int:
+    """The first of n rows with a number that is not finite."""
+    return int(np.argwhere(~np.isfinite(rows))[0][0])

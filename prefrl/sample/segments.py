@@ -10,7 +10,7 @@ import numpy as np
 
 from prefrl.policies.divided import environments
 from prefrl.policies.rollout import Act, Rollout, collect, joined
-from prefrl.protocols import ControlTask, Mixed
+from prefrl.protocols import ControlTask, Mixed, OfEnvironment
 from prefrl.types import Floats, Segment
 
 OVERLAP = 24
@@ -131,8 +131,10 @@ def _ages(ends: np.ndarray, before: np.ndarray) -> np.ndarray:
 
 
 def _too_short(task: ControlTask, steps: int, held: int, count: int, longest: int) -> str:
+    ends = isinstance(task, OfEnvironment) and task.variable_horizon
+    fixed = ", or leave task.variable_horizon at false, so that episodes do not end early" if ends else ""
     return (
         f"{steps} steps of the starting policy hold {held} segments of {task.segment_steps} steps within one episode, "
         f"but {count} were asked for; the longest episode seen had {longest} steps: make task.segment_seconds (or "
-        "segment_steps) smaller, or leave task.variable_horizon at false, so that episodes do not end early"
+        f"segment_steps) smaller{fixed}"
     )

@@ -1,7 +1,7 @@
 """The stages on their own: collect labels, fit a reward model, improve a policy, evaluate one."""
 
 from prefrl.stages.labels import Tell, attended, label, read_queries, serve, with_gold
-from prefrl.stages.policies import evaluate, export_onnx, export_sb3, load_policy, on_stage
+from prefrl.stages.policies import evaluate, export_onnx, export_sb3, load_policy, on_stage, shown_of
 from prefrl.stages.rewards import (
     config_of,
     export_classifier,
@@ -37,6 +37,7 @@ __all__ = [
     "report_card",
     "reward_of",
     "serve",
+    "shown_of",
     "shrink",
     "with_gold",
     "with_reward",

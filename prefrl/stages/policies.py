@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from prefrl.config import Config
-from prefrl.policies.loaded import Loaded
+from prefrl.policies.loaded import Loaded, check_leaves, outside
 from prefrl.policies.zips import Zipped, read_zip
 from prefrl.protocols import Acts, ControlTask, Settles, control
 from prefrl.rundir import RunError, open_saved
@@ -36,7 +36,8 @@ def load_policy(path: str | Path, best: bool = False) -> Loaded:
     if Path(path).is_file():
         return _zipped(Path(path), best).loaded()
     learner, task, _ = _acting(_there(Path(path)), best)
-    return Loaded(learner.actor(), task.observation_size, task.action_size, task.action_bounds is None)
+    discrete = task.action_bounds is None
+    return Loaded(learner.actor(), task.observation_size, task.action_size, discrete, outside(task))
 
 
 def on_stage(path: Path, env: str | None, best: bool = False) -> tuple[Loaded, ControlTask]:
@@ -75,7 +76,8 @@ def export_onnx(path: Path, to: Path, best: bool = False) -> None:
     if path.is_file():
         save_onnx(_zipped(path, best).actor(), to)
         return
-    learner, _, _ = _acting(_there(path), best)
+    learner, task, _ = _acting(_there(path), best)
+    check_leaves(task)
     if not isinstance(learner, ControlLearner):
         raise RunError(
             f"{path}: expected a run with learner.kind=control, and its policy is that of a {type(learner).__name__}; "
@@ -86,6 +88,12 @@ def export_onnx(path: Path, to: Path, best: bool = False) -> None:
         wanted = " or ".join(ACTIVATIONS)
         raise RunError(f"{path}: expected learner.policy.kind=mlp with {wanted}; no other is written as ONNX")
     save_onnx(policy.numpy_actor(), to)
+
+
+def shown_of(path: Path) -> str:
+    """In words, in brackets, what a run's policy sees of its task's observations; empty where that is all of them."""
+    found = outside(open_saved(path).config.build_task()) if path.is_dir() else None
+    return f" ({found.shown})" if found is not None and found.shown else ""
 
 
 def _zipped(path: Path, best: bool) -> Zipped:

@@ -44,6 +44,7 @@ def test_the_commands_know_every_form() -> None:
 def test_a_policy_leaves_with_a_readme(prefrl: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder_of_run(tmp_path / "run", [-1200.0, -180.0], {"task": {"kind": "control"}, "seed": 0})
     monkeypatch.setattr("prefrl.stages.export_onnx", lambda source, to, best: to.write_bytes(b"a network"))
+    monkeypatch.setattr("prefrl.stages.shown_of", lambda source: "")
     assert prefrl("export run --form onnx --to policy.onnx")[0] == 0
     assert "Gold rose from −1,200 to −180" in (tmp_path / "policy.onnx.md").read_text()
     code, printed = prefrl("export run --form policy --best --to policy")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 from inspect import signature
 from typing import Any
 
@@ -35,11 +36,12 @@ from prefrl.improve.sb3 import (
     relabel,
 )
 from prefrl.policies.rollout import learned_rewards
+from prefrl.protocols import Environments, Transition
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.sequence import GRUSettings
 from prefrl.storage.checkpoints import load_state, save_state
 from prefrl.store import Store
-from prefrl.types import Segment, Steps
+from prefrl.types import Bools, Floats, Segment, Steps
 
 NET = {"net_arch": [8]}
 PPO: dict[str, Any] = {"algorithm": "PPO", "options": {"n_steps": 20, "n_epochs": 2, "batch_size": 40}}
@@ -252,6 +254,63 @@ def test_a_time_limit_is_told_from_a_termination_and_the_last_observation_kept()
 
 def test_discrete_actions_are_seen_one_hot_from_any_start() -> None:
     assert executed(gymnasium.spaces.Discrete(3, start=5), np.array([5, 7])).tolist() == [[1, 0, 0], [0, 0, 1]]
+
+
+def _diverging(discrete: bool, at: int, starts: tuple[float, ...] = ()) -> GymnasiumTask:
+    """The point, of which one observation is no number: the `at`-th that a step leads to, of the second environment."""
+    task = point(discrete=discrete)
+
+    def make(count: int) -> Environments:
+        return Diverging(task.make(count), at, starts)
+
+    return replace(task, make=make)
+
+
+class Diverging:
+    def __init__(self, inner: Environments, at: int, starts: tuple[float, ...]) -> None:
+        self._inner, self._left, self._starts = inner, at, starts
+
+    def reset(self, rng: np.random.Generator) -> Floats:
+        first = self._inner.reset(rng)
+        return np.array(self._starts, np.float32)[:, None] if self._starts else first
+
+    def states(self) -> Floats | None:
+        return None
+
+    def legal(self) -> Bools | None:
+        return None
+
+    def step(self, actions: Floats) -> Transition:
+        step, self._left = self._inner.step(actions), self._left - 1
+        if self._left:
+            return step
+        final, following = step.final_observations.copy(), step.observations.copy()
+        final[1] = np.nan
+        if not step.truncated[1]:
+            following[1] = np.nan
+        return step._replace(observations=following, final_observations=final)
+
+
+@pytest.mark.parametrize("name", ["PPO", "SAC", "TD3", "DQN"])
+@pytest.mark.parametrize("at", [13, 20])
+def test_an_observation_that_is_no_number_stops_the_run_also_where_an_episode_ends_with_it(
+    store: Store[Segment], name: Name, at: int
+) -> None:
+    learner = _learner(_diverging(ALGORITHMS[name].actions == "discrete", at), _settings(name))
+    with pytest.raises(FloatingPointError, match=f"observation of environment 1 after step {at - 1} of the rollout"):
+        learner.improve(Known(), store, np.random.default_rng(0))
+
+
+def test_what_an_algorithm_does_and_what_an_episode_begins_with_are_numbers_too() -> None:
+    env = TaskEnv(ControlSettings(env="Pendulum-v1", horizon=9, segment_steps=3).build(), 2)
+    env.start(np.random.default_rng(0))
+    env.reset()
+    env.step(np.zeros((2, 1), np.float32))
+    with pytest.raises(FloatingPointError, match="action of environment 1 in step 1 of the rollout is"):
+        env.step(np.array([[0.5], [np.nan]], np.float32))
+    env = TaskEnv(_diverging(discrete=False, at=99, starts=(0.0, np.inf)), 2)
+    with pytest.raises(FloatingPointError, match="first observation of an episode of environment 1"):
+        env.reset()
 
 
 @both

@@ -11,6 +11,7 @@ import pytest
 from prefrl.envs.control import ControlSettings, GymnasiumTask
 from prefrl.evaluate.policies import evaluation
 from prefrl.policies.rollout import Rollout, collect, joined, learned_rewards, whole_episodes
+from prefrl.protocols import Transition
 from prefrl.reward_models.mlp import MLPSettings
 from prefrl.reward_models.steps import StepReward
 from prefrl.types import Bools, Floats
@@ -64,29 +65,41 @@ def test_whole_episodes_spend_exactly_a_fixed_horizon() -> None:
 
 
 def test_an_observation_that_is_not_finite_is_an_error_that_names_it_and_the_step() -> None:
-    class Broken:
-        def __init__(self) -> None:
-            self.inner, self.steps = _task().environments(2), 0
-
-        def reset(self, rng: np.random.Generator) -> Floats:
-            return self.inner.reset(rng)
-
-        def states(self) -> Floats | None:
-            return None
-
-        def legal(self) -> Bools | None:
-            return None
-
-        def step(self, actions: Floats):  # type: ignore[no-untyped-def]
-            self.steps += 1
-            step = self.inner.step(actions)
-            if self.steps == 3:
-                step.final_observations[1, 2] = np.nan
-            return step
-
-    envs = Broken()
+    envs = Broken(steps=3, name="final_observations")
     with pytest.raises(FloatingPointError, match="observation of environment 1 after step 2"):
         collect(envs, envs.reset(np.random.default_rng(0)), 5, _act)
+
+
+def test_an_observation_that_an_episode_begins_with_is_looked_at_too() -> None:
+    envs, first = Broken(steps=7, name="observations"), np.full((2, 3), np.nan, np.float32)
+    for begins in (envs.reset(np.random.default_rng(0)), first):  # the second episode's, and the first one's
+        with pytest.raises(FloatingPointError, match=r"first observation of an episode of environment [01] is not"):
+            collect(envs, begins, 9, _act)
+
+
+class Broken:
+    """Two pendulums, of which the second is no number in one array after so many steps."""
+
+    def __init__(self, steps: int, name: str) -> None:
+        self.inner, self.left, self.name = _task().environments(2), steps, name
+
+    def reset(self, rng: np.random.Generator) -> Floats:
+        return self.inner.reset(rng)
+
+    def states(self) -> Floats | None:
+        return None
+
+    def legal(self) -> Bools | None:
+        return None
+
+    def step(self, actions: Floats) -> Transition:
+        self.left -= 1
+        step = self.inner.step(actions)
+        if self.left:
+            return step
+        wrong: Floats = step._asdict()[self.name].copy()
+        wrong[1, 2] = np.nan
+        return step._replace(**{self.name: wrong})
 
 
 def test_a_reward_that_is_not_finite_is_an_error_that_names_it_and_the_step() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -125,12 +126,15 @@ def test_a_first_rollout_stops_as_soon_as_it_holds_enough_where_episodes_end_ear
 def test_episodes_that_are_shorter_than_segments_are_an_error_and_not_endless() -> None:
     task = _task(env="CartPole-v1", horizon=200, segment_steps=150, variable_horizon=True)
     right = np.array([0.0, 1.0], np.float32)
-    with pytest.raises(
-        ValueError, match=r"hold 0 segments of 150 steps.* 20 were.*longest episode seen had (9|10|11) "
+    said = r"hold 0 segments of 150 steps.* 20 were.*longest episode seen had (9|10|11) .*segment_steps\) smaller"
+    for one, ends in (
+        (task, r", or leave task\.variable_horizon at false, so that episodes do not end early$"),
+        (replace(task, variable_horizon=False), "$"),  # not what such a task was told
     ):
-        first_rollout(
-            task, lambda o, legal, begins: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0)
-        )
+        with pytest.raises(ValueError, match=said + ends):
+            first_rollout(
+                one, lambda o, legal, begins: (np.tile(right, (len(o), 1)),) * 2, 20, 4, np.random.default_rng(0)
+            )
 
 
 def test_windows_are_counted_across_parts_as_in_the_whole() -> None:

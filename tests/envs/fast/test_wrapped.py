@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 
 from prefrl.envs.fast.classic import Pendulum
 from prefrl.envs.fast.vectorised import Vectorised
@@ -64,6 +65,57 @@ def test_an_episode_may_end() -> None:
     assert 8 <= first + 1 <= 11
     assert abs(steps[first].final_observations[0, 2]) > 0.2
     assert abs(steps[first].observations[0, 2]) < 0.05
+
+
+class Limited(gymnasium.Env[np.ndarray, Any]):
+    """Counts its steps, and says after each `limit` of them that time is up."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 99.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._count = limit, 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self._count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self._count += 1
+        return np.array([self._count], np.float32), 1.0, False, self._count == self._limit, {}
+
+
+@pytest.mark.parametrize(
+    ("after", "limit", "counts", "rewards"),
+    [
+        ("absorb", 3, [1, 2, 3, 3, 3, 3, 3], [1, 1, 1, 0, 0, 0, 0]),
+        ("restart", 3, [1, 2, 0, 1, 2, 0, 1], [1] * 7),
+        ("absorb", 7, [1, 2, 3, 4, 5, 6, 7], [1] * 7),
+        ("restart", 7, [1, 2, 3, 4, 5, 6, 7], [1] * 7),
+    ],
+)
+def test_a_limit_of_the_environments_own_does_not_shorten_an_episode(
+    after: AfterEnd, limit: int, counts: list[int], rewards: list[int]
+) -> None:
+    envs = Wrapped(partial(Limited, limit), 2, 7, after)
+    envs.reset(np.random.default_rng(0))
+    for _ in range(2):  # the second episode is as long
+        steps = [envs.step(np.zeros((2, 1), np.float32)) for _ in range(7)]
+        assert [step.final_observations.tolist() for step in steps] == [[[count]] * 2 for count in counts]
+        assert [step.rewards.tolist() for step in steps] == [[reward] * 2 for reward in rewards]
+        assert [step.truncated.tolist() for step in steps] == [[False] * 2] * 6 + [[True] * 2]
+        assert not any(step.terminated.any() for step in steps)
+        assert steps[-1].observations.tolist() == [[0.0], [0.0]]
+
+
+def test_where_episodes_may_end_a_limit_of_the_environments_own_is_a_time_limit() -> None:
+    envs = Wrapped(partial(Limited, 3), 1, 7, "end")
+    envs.reset(np.random.default_rng(0))
+    steps = [envs.step(np.zeros((1, 1), np.float32)) for _ in range(6)]
+    assert [bool(step.truncated[0]) for step in steps] == [False, False, True] * 2
+    assert not any(step.terminated.any() for step in steps)
 
 
 def test_a_discrete_action_may_start_at_any_number() -> None:
