@@ -66,7 +66,7 @@ def improve(
         raise ValueError(nothing_shown(settings.kind))
     rows = Responses.of(chosen, writer.policy.task, writer.policy.device)
     lengths = rows.lengths()
-    writer.policy.check_room(int(lengths.max()), chosen[int(lengths.argmax())].prompt)
+    writer.policy.check_room(int(lengths.max()), chosen[int(lengths.argmax())].prompt, written=True)
     turns = [at for _ in range(settings.epochs) for at in shuffled(len(rows), settings.minibatch, rng)]
     return means(list(supervised(writer, settings, rows, writer.paced(turns)))) | {"responses": float(len(rows))}
 
