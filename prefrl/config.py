@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest, todays
+from prefrl.exchange.worlds import other_worlds
 from prefrl.fit.settings import FittingSettings, check_settings, check_shown
 from prefrl.kinds import named
 from prefrl.loop import Loop, LoopSettings
@@ -105,6 +106,10 @@ class Config(Settings):
     def discount(self) -> float:
         """The learner's own."""
         return cast(LearnerSettings, self.learner).discount
+
+    def notes(self) -> list[str]:
+        """What a person should know before it starts: what is named from elsewhere was made in another world."""
+        return other_worlds(self.task, {"labeler": self.labeler, "learner": self.learner})
 
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:

@@ -81,6 +81,7 @@ class Run:
             # Only now: what cannot be built is not to keep a folder of judgements from other settings. What may differ
             # from start to start, a port say, is kept as it is now.
             write_file(self.folder / "config.yaml", config.dump().encode())
+            self.notes += config.notes()
             if isinstance(self.loop.task, Noted):
                 self.notes += self.loop.task.notes
             self._start_from(reward)

@@ -32,6 +32,8 @@ def estimate(config: Config, tell: Tell = lambda _: None) -> Spent:
     with tempfile.TemporaryDirectory() as scratch, Store(Path(scratch)) as store:
         loop = small.build(store)
         loop.check_shown()
+        for note in config.notes():
+            tell(note)
         for note in loop.task.notes if isinstance(loop.task, Noted) else ():
             tell(note)
         start, one = (round.metrics for round in loop.run())
