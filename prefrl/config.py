@@ -313,7 +313,7 @@ def _check_holds(store: Store, task: Task) -> None:
     ours = named(task.kind)
     if store.holds and store.holds != ours.noun:
         raise ConfigError(
-            f"{store.folder} holds {store.holds}s, and {task.name} (task.kind) is learned from {ours.noun}s: choose "
+            f"{store.folder} holds {store.holds}s, and {task.name} is learned from {ours.noun}s: choose "
             "another folder with --out, or the task that these are for"
         )
 
