@@ -15,7 +15,9 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError
 from pydantic_core import ErrorDetails
 
 from prefrl.components import ConfigError, Role, Settings, kinds, settings_class, suggest, todays
+from prefrl.exchange.worlds import other_worlds
 from prefrl.fit.settings import FittingSettings, check_settings, check_shown
+from prefrl.kinds import named
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
     Demonstrates,
@@ -26,7 +28,6 @@ from prefrl.protocols import (
     LabelerSettings,
     Learner,
     LearnerSettings,
-    NeedsShowing,
     Particular,
     PartlyGraded,
     Retells,
@@ -106,6 +107,10 @@ class Config(Settings):
         """The learner's own."""
         return cast(LearnerSettings, self.learner).discount
 
+    def notes(self) -> list[str]:
+        """What a person should know before it starts: what is named from elsewhere was made in another world."""
+        return other_worlds(self.task, {"labeler": self.labeler, "learner": self.learner})
+
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:
         """Read a preset ("control/pendulum") or a YAML file, with `dotted.key=value` overrides.
@@ -154,15 +159,15 @@ class Config(Settings):
 
         rng, select = streams(self.seed, 0).build, cast(SelectorSettings, self.select)
         task = self.build_task()
+        if store is not None:  # which is with the first of several ranks alone
+            _check_holds(store, task)
         learner, reward = self.build_learner(task, rng), self.build_reward(task, rng)
         labeler = self.build_labeler(task)
         self._check_labeler(labeler, learner)
         self._check_gold(labeler, task)
-        if store is not None:  # which is with the first of several ranks alone
+        if store is not None:
             shows = _shows(labeler) or bool(store.demonstrations())
             check_shown(self.fitting, shows)
-            if isinstance(learner, NeedsShowing):
-                learner.check_shown(shows)
         check_settings(self.fitting, not trainable(reward), task.kind, select.candidates)
         if isinstance(select, UnscoredSettings) and select.best_of > self.loop.pool:
             raise ConfigError(
@@ -301,6 +306,16 @@ def read_settings(source: str | Path) -> Json:
 def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
     mark = error.problem_mark or error.context_mark
     return f"{source}, line {mark.line + 1}" if mark else str(source)
+
+
+def _check_holds(store: Store, task: Task) -> None:
+    """Raises `ConfigError` where what was asked about or shown before is of another kind than the task's."""
+    ours = named(task.kind)
+    if store.holds and store.holds != ours.noun:
+        raise ConfigError(
+            f"{store.folder} holds {store.holds}s, and {task.name} is learned from {ours.noun}s: choose "
+            "another folder with --out, or the task that these are for"
+        )
 
 
 def _shows(labeler: Labeler) -> bool:

@@ -18,11 +18,14 @@ from prefrl.components import Settings
 from prefrl.evaluate.health import warnings
 from prefrl.fit.settings import FittingSettings
 from prefrl.protocols import (
+    Attended,
+    Demonstrates,
     Examined,
     Imagines,
     Imitates,
     Labeler,
     Learner,
+    NeedsShowing,
     Paced,
     RewardModel,
     Selector,
@@ -101,6 +104,19 @@ class Loop(Generic[C]):
     _seconds: Metrics = field(default_factory=dict)
     _notes: list[str] = field(default_factory=list)
     _warned: set[str] = field(default_factory=set)
+
+    def check_shown(self) -> None:
+        """Raises `ConfigError`, before anything is spent, where what the learner learns from neither is there nor will
+        be, or where a labeler has nothing to answer with."""
+        counts, labeler = self.store.counts(), self.labeler
+        shown = counts.get("demonstrations", 0)
+        shows = isinstance(labeler, Demonstrates) and labeler.demonstrates
+        asks = self.settings.labels or isinstance(labeler, Attended) or self.store.open_queries()
+        if isinstance(labeler, NeedsShowing) and asks:
+            labeler.check_shown(bool(shown), judged=False)
+        if isinstance(self.learner, NeedsShowing):
+            judged = counts["answered"] > shown or bool(asks and not shows)
+            self.learner.check_shown(shows or bool(shown), judged)
 
     def run(self) -> Iterator[Round[C]]:
         """Go on from where the loop stands to the last round."""

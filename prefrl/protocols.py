@@ -805,10 +805,13 @@ class Imitates(Protocol):
 
 @runtime_checkable
 class NeedsShowing(Protocol):
-    """A learner that may need demonstrations beside a reward."""
+    """A learner, or a labeler, that may need demonstrations."""
 
-    def check_shown(self, shows: bool) -> None:
-        """Raises `ConfigError`, before anybody is asked, where it needs them and nobody `shows` any."""
+    def check_shown(self, shows: bool, judged: bool) -> None:
+        """Raises `ConfigError`, before anybody is asked, where it needs them and there are none.
+
+        `shows`: whether some are there, or for a learner will be; `judged`: the same of judgements.
+        """
 
 
 @runtime_checkable

@@ -74,8 +74,14 @@ class Run:
         _refuse_strangers(self.folder)
         with ExitStack() as opened:  # whatever fails, Ctrl-C too: a folder must not stay owned by a start that failed
             self.store: Store = opened.enter_context(Store(self.folder))
-            _claim(config, self.folder, self.store)
-            self.loop: Loop = shared(config.build(self.store))
+            _refuse_others(config, self.folder, self.store)
+            loop = config.build(self.store)
+            loop.check_shown()
+            self.loop: Loop = shared(loop)
+            # Only now: what cannot be built is not to keep a folder of judgements from other settings. What may differ
+            # from start to start, a port say, is kept as it is now.
+            write_file(self.folder / "config.yaml", config.dump().encode())
+            self.notes += config.notes()
             if isinstance(self.loop.task, Noted):
                 self.notes += self.loop.task.notes
             self._start_from(reward)
@@ -357,8 +363,8 @@ def _refuse_strangers(folder: Path) -> None:
         raise RunError(f"{folder} is not empty ({strangers[0]} ...) and holds no run: choose another folder")
 
 
-def _claim(config: Config, folder: Path, store: Store) -> None:
-    """Make the folder one of these settings, or see that it is already.
+def _refuse_others(config: Config, folder: Path, store: Store) -> None:
+    """Raise `RunError` where a folder holds a run with other settings.
 
     Where nothing has happened yet, because a start failed, new settings take the place of the old ones.
     """
@@ -368,7 +374,6 @@ def _claim(config: Config, folder: Path, store: Store) -> None:
     if _lasting(found) != _lasting(config):
         difference = _difference(_lasting(found), _lasting(config))
         raise RunError(f"{folder} holds a run with other settings ({difference}): choose another folder")
-    write_file(path, config.dump().encode())  # what may differ from start to start, a port say, is kept as it is now
 
 
 def _lasting(config: Config) -> Config:

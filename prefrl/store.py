@@ -165,13 +165,9 @@ class Store(Generic[C]):
 
     def _check_kind(self, candidates: Iterable[Candidate]) -> None:
         """A store holds candidates of one kind: a learner could make nothing of the others."""
-        with self.log.reading() as connection:
-            there = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
-        new = next(iter(candidates), None)
-        if there is not None and new is not None and there["type"] != describe(new)["type"]:
-            raise StoreError(
-                f"the store in {self.folder} holds {there['type']}s, and cannot hold {type(new).__name__}s"
-            )
+        there, new = self.holds, next(iter(candidates), None)
+        if there and new is not None and there != describe(new)["type"]:
+            raise StoreError(f"the store in {self.folder} holds {there}s, and cannot hold {type(new).__name__}s")
 
     def _file(self, candidates: Iterable[Candidate]) -> None:
         """Write arrays and gold, each under its id; in threads, since each file waits for the disk."""
@@ -189,6 +185,13 @@ class Store(Generic[C]):
     def sequence(self) -> int:
         """The number of the newest event: the snapshot that a fit is made on."""
         return self.log.sequence
+
+    @property
+    def holds(self) -> str:
+        """What its candidates are called (`Kind.noun`); "" where there are none yet."""
+        with self.log.reading() as connection:
+            body = connection.scalar(sql.select(event.c.body).where(event.c.kind == "candidate").limit(1))
+        return str(body["type"]) if body else ""
 
     def open_queries(self, labeler: str = "") -> list[Query[C]]:
         """Queries without a judgement that this labeler has not skipped, oldest first. Candidates carry no gold."""

@@ -18,10 +18,11 @@ from rich.progress import Task as Row
 from rich.table import Table
 from rich.text import Text
 
-from prefrl.components import resume_command
+from prefrl.components import ConfigError, resume_command
 from prefrl.evaluate.card import ReportCard
 from prefrl.kinds import named
 from prefrl.loop import Loop
+from prefrl.protocols import NeedsShowing
 from prefrl.report import card_words
 from prefrl.types import Fields, Round
 
@@ -117,12 +118,19 @@ def drive(running: Run) -> None:
 
 
 def _nothing_learned(running: Run) -> str:
-    if shown := len(running.loop.store.demonstrations()):
+    learner, counts = running.loop.learner, running.loop.store.counts()
+    shown = counts.get("demonstrations", 0)
+    if isinstance(learner, NeedsShowing):
+        try:
+            learner.check_shown(bool(shown), judged=counts["answered"] > shown)
+        except ConfigError as error:
+            return f"nothing was learned: {error}"
+    if shown:
         return (
             f"nothing was learned: there are {shown} demonstrations and no judgements, and this learner learns from "
             "judgements; set learner.kind=clone, or sft for text"
         )
-    if not running.loop.store.counts()["answered"]:
+    if not counts["answered"]:
         return (
             "nothing was learned: there is not a single answer in this run; ask for some with loop.labels, or begin "
             "with a folder of judgements that `prefrl import` wrote"

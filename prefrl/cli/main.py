@@ -183,15 +183,26 @@ def demonstrate(
     """Let an expert show whole episodes, which can be cloned: `learner.data=FOLDER` reads them."""
     from prefrl import stages
     from prefrl.cli.console import say
+    from prefrl.components import ConfigError
 
     refuse(_holds_anything(out), f"{out} holds answers already: say with --out where new demonstrations go")
     policy = [f"labeler.policy={json.dumps(str(expert))}"] if expert else []
     shows = ["labeler.kind=expert", f"labeler.episodes={episodes}", f"labeler.noise={noise}", *policy]
     asks = ["select.kind=uniform", "select.candidates=1", "loop.labels=0"]
-    stages.label(_load(source, [*shows, *asks, *(overrides or [])]), out, tell=say)
+    try:
+        stages.label(_load(source, [*shows, *asks, *(overrides or [])]), out, tell=lambda note: say(_as_options(note)))
+    except ConfigError as error:
+        raise ConfigError(_as_options(str(error))) from error
     same = [override for override in overrides or [] if override.startswith("task.")]
     clone = [source, *same, "learner.kind=clone", f"learner.data={out}", "loop.labels=0", "loop.rounds=1"]
     say(f"{_progress(out)}. Clone them with: {shlex.join(['prefrl', 'run', *clone])}")
+
+
+def _as_options(text: str) -> str:
+    """Words about an expert's settings, about the options that set them."""
+    for option in ("policy", "episodes", "noise"):
+        text = text.replace(f"labeler.{option}", f"--{option.replace('policy', 'expert')}")
+    return text
 
 
 @app.command()

@@ -31,8 +31,10 @@ def minari_rows(folder: Path) -> Parts:
         yield f"{LABELS}, row {number}", partial(_parse, line, episodes)
 
 
-def episodes(folder: Path) -> tuple[list[Segment], tuple[Floats, Floats]]:
+def episodes(folder: Path) -> tuple[list[Segment], tuple[Floats, Floats] | None]:
     """Every episode, judged or not, as a segment, and the bounds of actions (A,), infinite where there are none.
+
+    Discrete actions have no bounds (None), and become one-hot.
 
     The gold is attached where rewards are the task's own: in data sets that were not exported from a store.
     """
@@ -43,12 +45,12 @@ def episodes(folder: Path) -> tuple[list[Segment], tuple[Floats, Floats]]:
         (data,), (meta,) = storage.get_episodes([number]), storage.get_episode_metadata([number])
         options = meta.get("options") or {}
         if "candidate" in options:
-            found.append(_segment(data, options))
+            found.append(_segment(data, options, storage.action_space))
         else:
-            one = _segment(data, {"episode": f"episode {number}"})
+            one = _segment(data, {"episode": f"episode {number}"}, storage.action_space)
             found.append(replace(one, gold=np.asarray(data["rewards"], np.float64)))
     space = storage.action_space
-    return found, (space.low.astype(np.float32), space.high.astype(np.float32))
+    return found, None if _discrete(space) else (space.low.astype(np.float32), space.high.astype(np.float32))
 
 
 def _storage(folder: Path) -> Any:
@@ -59,12 +61,29 @@ def _storage(folder: Path) -> Any:
         raise ValueError(f"{folder / 'metadata.json'} is no JSON: {error}") from None
     known = metadata if isinstance(metadata, dict) else {}
     spaces = [known.get(name) for name in ("observation_space", "action_space")]
-    boxes = [json.loads(space) for space in spaces if isinstance(space, str)]
-    if [isinstance(box, dict) and box.get("type") for box in boxes] != ["Box", "Box"]:
-        raise ValueError(f"{folder}: expected a Minari data set whose observations and actions are each a Box")
+    read = [json.loads(space) for space in spaces if isinstance(space, str)]
+    if [isinstance(space, dict) and space.get("type") for space in read] not in (["Box", "Box"], ["Box", "Discrete"]):
+        raise ValueError(
+            f"{folder}: expected a Minari data set whose observations and actions are each a Box, or whose actions are "
+            "Discrete"
+        )
     from minari.dataset.minari_storage import MinariStorage
 
-    return MinariStorage.read(folder.absolute())
+    try:
+        return MinariStorage.read(folder.absolute())
+    except ModuleNotFoundError:
+        raise
+    except ImportError as error:  # Minari's own words, where what reads the data's form is not there
+        raise ValueError(
+            f"{folder} has data in the form {known.get('data_format')!r}, and what reads it is missing: "
+            f"pip install 'prefrl[interchange]' ({error})"
+        ) from error
+
+
+def _discrete(space: Any) -> bool:
+    from gymnasium.spaces import Discrete
+
+    return isinstance(space, Discrete)
 
 
 @dataclass
@@ -81,15 +100,27 @@ class _Episodes:
         if number not in self.found:
             (data,) = self.storage.get_episodes([number])
             (meta,) = self.storage.get_episode_metadata([number])
-            self.found[number] = _segment(data, meta.get("options") or {})
+            self.found[number] = _segment(data, meta.get("options") or {}, self.storage.action_space)
         return self.found[number]
 
 
-def _segment(data: Fields, options: Fields) -> Segment:
-    observations, actions = (np.asarray(data[name], np.float32) for name in ("observations", "actions"))
+def _segment(data: Fields, options: Fields, space: Any) -> Segment:
+    observations = np.asarray(data["observations"], np.float32)
+    actions = _one_hot(data, space) if _discrete(space) else np.asarray(data["actions"], np.float32)
     if not np.isfinite(observations).all() or not np.isfinite(actions).all():
         raise ValueError(f"episode {data['id']} holds values that are not finite")
     return Segment(observations[:-1], actions, str(options.get("episode")), int(options.get("start", 0)))
+
+
+def _one_hot(data: Fields, space: Any) -> Floats:
+    """(T,) discrete actions, which count from the space's start, -> (T, A)."""
+    actions, start, count = np.asarray(data["actions"]), int(space.start), int(space.n)
+    if actions.ndim != 1 or not np.isin(actions, np.arange(start, start + count)).all():
+        raise ValueError(
+            f"episode {data['id']} has actions that are not whole numbers from {start} to {start + count - 1}"
+        )
+    found: Floats = (actions[:, None] == np.arange(start, start + count)).astype(np.float32)
+    return found
 
 
 def _parse(line: str, episodes: _Episodes) -> Sequence[Row | str]:

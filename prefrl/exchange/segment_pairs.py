@@ -6,18 +6,14 @@ and for each labeler L `P_label_L` (pairs,): 0 where the first segment is better
 
 from __future__ import annotations
 
-import hashlib
-import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from prefrl.exchange.layout import Parts, Row
+from prefrl.exchange.segment_arrays import archived, finite, named, rows
 from prefrl.judgements import Comparison
 from prefrl.types import Fields, Query, Segment
 
@@ -26,7 +22,7 @@ ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
 
 def segment_pairs(path: Path) -> Parts:
     """(part and row, what reads it) for each pair. Raises `ValueError` where arrays are missing or do not fit."""
-    with _archive(path) as archive:
+    with archived(path) as archive:
         splits = _splits(archive)
         if not splits:
             raise ValueError(f"expected arrays named train_obs_1 and so on, got {', '.join(archive) or 'none'}")
@@ -36,61 +32,29 @@ def segment_pairs(path: Path) -> Parts:
                 yield f"{split}, row {i + 1}", partial(_rows, arrays, labels, split, i)
 
 
-def segments(path: Path) -> list[Segment]:
-    """Every distinct segment of pairs, judged or not, or of the arrays `observations` (N, T, O), `actions` (N, T, A)
-    and, where the gold is known, `rewards` (N, T).
+def segments(path: Path) -> dict[str, Segment]:
+    """Every distinct segment of pairs, judged or not, or of the arrays that `segment_arrays` describes, by its place.
 
     Raises `ValueError` as `segment_pairs` does.
     """
-    with _archive(path) as archive:
+    with archived(path) as archive:
         if "observations" in archive:
-            return _single(archive)
+            return rows(archive)
         if not (splits := _splits(archive)):
             known = ", ".join(archive) or "none"
             raise ValueError(f"expected arrays named train_obs_1 and so on, or observations and actions, got {known}")
-        found: dict[str, Segment] = {}
+        found: dict[str, tuple[str, Segment]] = {}
         for split in splits:
             arrays, _ = _arrays(archive, split)
-            every = (_segment(arrays, split, side, i) for i in range(len(arrays["obs_1"])) for side in ("1", "2"))
-            found |= {one.id: one for one in every}
-        return list(found.values())
-
-
-@contextmanager
-def _archive(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
-    """The arrays of a file, whose name stands in front of what is wrong with them."""
-    try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)  # a pickle can run any code
-            if not isinstance(archive, Mapping):
-                raise ValueError("expected an archive of arrays, got one array")
-            yield archive
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: {error}") from error
+            for i in range(len(arrays["obs_1"])):
+                for side in ("1", "2"):
+                    one = _segment(arrays, split, side, i)
+                    found.setdefault(one.id, (f"{split}, row {i + 1}, segment {side}", one))
+        return dict(found.values())
 
 
 def _splits(archive: Mapping[str, np.ndarray]) -> list[str]:
     return [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
-
-
-def _single(archive: Mapping[str, np.ndarray]) -> list[Segment]:
-    if "actions" not in archive:
-        raise ValueError("array actions is missing")
-    observations, actions = archive["observations"], archive["actions"]
-    gold = archive.get("rewards")
-    shapes = [array.shape for array in (observations, actions, gold) if array is not None]
-    fits = observations.ndim == actions.ndim == 3 and all(s[:2] == shapes[0][:2] for s in shapes)
-    if not fits or (gold is not None and gold.ndim != 2):
-        raise ValueError(f"expected observations (N, T, O), actions (N, T, A) and rewards (N, T), got {shapes}")
-    if any(array.dtype.kind != "f" for array in (observations, actions)):
-        raise ValueError(f"expected floats (one-hot for discrete actions), got {observations.dtype}, {actions.dtype}")
-    arrays = {"obs_1": observations, "action_1": actions}
-    plain = [_segment(arrays, "segment", "1", i) for i in range(len(observations))]
-    return (
-        plain
-        if gold is None
-        else [replace(one, gold=row.astype(np.float64)) for one, row in zip(plain, gold, strict=True)]
-    )
 
 
 def _arrays(file: Fields, split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -122,22 +86,15 @@ def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], sp
     first, second = (_segment(arrays, split, side, i) for side in ("1", "2"))
     query = Query((first, second))
     swapped = query.candidates[0].id != first.id  # a query sorts its candidates by id
-    rows: list[Row | str] = []
+    found: list[Row | str] = []
     for labeler, values in labels.items():
         value = float(values[i])
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"label_{labeler}: expected 0 (first better) to 1 (second better), got {value}")
-        rows.append(Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split))
-    return rows
+        found.append(Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split))
+    return found
 
 
 def _segment(arrays: Mapping[str, np.ndarray], split: str, side: str, i: int) -> Segment:
-    """A segment that is called after its part and its content: the same one in two pairs is one candidate."""
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, and is refused below
-        observations, actions = (arrays[f"{name}_{side}"][i].astype(np.float32) for name in ("obs", "action"))
-    for name, values in ((f"obs_{side}", observations), (f"action_{side}", actions)):
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            raise ValueError(f"{name} is {values[tuple(bad[0])]} at step {bad[0][0] + 1}; expected finite float32")
-    content = hashlib.sha256(observations.tobytes() + actions.tobytes()).hexdigest()[:16]
-    return Segment(observations, actions, episode=f"{split}/{content}", start=0)
+    seen, done = (finite(f"{name}_{side}", arrays[f"{name}_{side}"][i]) for name in ("obs", "action"))
+    return named(split, seen, done)

@@ -3,7 +3,7 @@
 - `{"prompt", "chosen", "rejected"}` as text, or as lists of `{"role", "content"}`; without a prompt where chosen and
   rejected are whole conversations. `"margin"` or `"preference"` says how much better;
 - `{"prompt", "completion", "label"}`: one response, good or not;
-- `{"prompt", "completion"}`: a demonstration;
+- `{"prompt", "completion"}`, or `{"messages"}` that end with the assistant's: a demonstration;
 - `{"prompt", "responses": [...]}` with one of `"ranks"`, `"best"`, `"ratings"` (and `"scale"`), `"preference"` or
   `"skip"`;
 - conversation trees of OpenAssistant (Koepf et al. 2023): a ranking of the replies to each of a person's turns;
@@ -47,8 +47,8 @@ from prefrl.exchange.transcripts import (
 from prefrl.judgements import Demonstration, Rating
 from prefrl.types import Fields, Json, Response
 
-COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "label", "responses", *VERDICTS, "scale")
-_NO_TEXT = ("margin", "label", "responses", *VERDICTS, "scale", "weight", "shown")
+COLUMNS = ("prompt", "chosen", "rejected", "margin", "completion", "messages", "label", "responses", *VERDICTS, "scale")
+_NO_TEXT = ("margin", "messages", "label", "responses", *VERDICTS, "scale", "weight", "shown")
 EXTRA = ("labeler", "weight", "shown", "split", "left", "right")
 TREE_ROLES = ("prompter", "assistant")
 
@@ -92,9 +92,10 @@ def form_of(row: Fields) -> str:
         return "pick-a-pic"
     if row.get("responses") is not None:
         return "responses"
-    if "completion" in row and "chosen" not in row:
+    if ("completion" in row or "messages" in row) and "chosen" not in row:
         # A column of another name may be the label: a bad response is not to be taken for a good one.
-        return "unpaired" if set(row) - {"prompt", "completion", "query", "at", *EXTRA} else "demonstrations"
+        known = {"prompt", "completion", "messages", "query", "at", *EXTRA}
+        return "unpaired" if set(row) - known else "demonstrations"
     return "preferences"
 
 
@@ -188,11 +189,24 @@ def _unpaired(row: Fields) -> list[Row | str]:
 
 def _completion(row: Fields) -> Response:
     completion = row.get("completion")
+    if completion is None and row.get("messages") is not None:
+        return _conversation(row["messages"])
     if isinstance(completion, list):
         completion = response_text(read_messages(completion))
     if not isinstance(completion, str) or not isinstance(row.get("prompt"), str | list):
         raise ValueError(f'expected "prompt" and "completion" as text or messages, got {row!r:.200}')
     return Response(_prompt(row["prompt"]), completion)
+
+
+def _conversation(value: Any) -> Response:
+    """The assistant's last words as a response to all before them."""
+    messages = read_messages(value)
+    if len(messages) < 2 or messages[-1]["role"] != "assistant":
+        raise ValueError(
+            "column 'messages': expected a conversation that ends with the assistant's words, got "
+            f"{', '.join(one['role'] for one in messages)}"
+        )
+    return Response(prompt_text(messages[:-1]), response_text(messages[-1:]))
 
 
 def _demonstration(row: Fields) -> list[Row | str]:

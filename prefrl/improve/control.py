@@ -338,7 +338,7 @@ class ControlLearner:
         self._take(state)
         self._player.load(state)
 
-    def check_shown(self, shows: bool) -> None:
+    def check_shown(self, shows: bool, judged: bool) -> None:
         if self._imitation is not None:
             self._imitation.check(shows)
 

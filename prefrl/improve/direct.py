@@ -15,7 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from prefrl.components import Settings
+from prefrl.components import ConfigError, Settings
 from prefrl.fit.pairs import Batch
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.objectives import dpo_loss, ipo_loss
@@ -164,6 +164,14 @@ def _parts(policy: LanguagePolicy, settings: HeldSettings, pairs: Pairs, at: Int
         yield (loss(gains, preference) * share).sum(), measured(margins, preference, share)
 
 
+def nothing_shown(kind: str) -> str:
+    """Of a learner that imitates."""
+    return (
+        f"{kind} learns what was shown and the better responses; there is no demonstration, and no judgement names a "
+        "better one: import demonstrations, or raise loop.labels"
+    )
+
+
 class Direct:
     """A `prefrl.protocols.Learner` of responses: direct methods, RAFT and supervised fine-tuning differ in how they
     improve alone."""
@@ -178,6 +186,10 @@ class Direct:
 
     def imitates(self, store: Store[Response]) -> bool:
         return self._settings.imitates and bool(store.demonstrations())
+
+    def check_shown(self, shows: bool, judged: bool) -> None:
+        if self._settings.imitates and not (shows or judged):
+            raise ConfigError(nothing_shown(self._settings.kind))
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Response]:
         return self._writer.ask(count, self._settings.asked_responses, rng)

@@ -141,6 +141,10 @@ class Offline(Generic[P]):
     def imitates(self, store: Store[Segment]) -> bool:
         return self._settings.imitates and bool(self._data or store.demonstrations())
 
+    def check_shown(self, shows: bool, judged: bool) -> None:
+        if not (self._data or shows or (judged and not self._settings.imitates)):
+            raise ConfigError(_nothing(self._settings))
+
     @property
     def steps(self) -> Steps:
         return self._player.steps

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from prefrl.improve.direct import Direct, DirectSettings
+from prefrl.improve.direct import Direct, DirectSettings, nothing_shown
 from prefrl.improve.gradient import Parts, descend, in_parts
 from prefrl.improve.pairs import means, shuffled
 from prefrl.improve.writer import Writer
@@ -63,13 +63,10 @@ def improve(
     """
     chosen = best_responses(store)
     if not chosen:
-        raise ValueError(
-            f"{settings.kind} learns what was shown and the better responses; there is no demonstration, and no "
-            "judgement names a better one: import demonstrations, or raise loop.labels"
-        )
+        raise ValueError(nothing_shown(settings.kind))
     rows = Responses.of(chosen, writer.policy.task, writer.policy.device)
     lengths = rows.lengths()
-    writer.policy.check_room(int(lengths.max()), chosen[int(lengths.argmax())].prompt)
+    writer.policy.check_room(int(lengths.max()), chosen[int(lengths.argmax())].prompt, written=True)
     turns = [at for _ in range(settings.epochs) for at in shuffled(len(rows), settings.minibatch, rng)]
     return means(list(supervised(writer, settings, rows, writer.paced(turns)))) | {"responses": float(len(rows))}
 

@@ -24,6 +24,8 @@ from prefrl.protocols import ControlTask, Store, Task, control
 from prefrl.sample.segments import piece, placed
 from prefrl.types import Query, Segment
 
+MORE = "set labeler.data or labeler.expert.episodes"
+
 
 class DemonstratorSettings(Settings):
     """Answer each segment of the learner's own with a piece of recorded demonstrations, whatever it is."""
@@ -69,6 +71,10 @@ class Demonstrator:
     demonstrates: bool = True
     corrects: bool = True
 
+    def check_shown(self, shows: bool, judged: bool) -> None:
+        if not (self.shown or self.expert or shows):
+            raise ConfigError(f"labeler.kind=demonstrator answers with what was shown, and nothing was: {MORE}")
+
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Answer every open query with a random piece of the same length.
 
@@ -90,8 +96,8 @@ def _like(query: Query[Segment], known: Sequence[Segment], rng: np.random.Genera
     if not starts.sum():
         where = f" in {context}" if context else ""
         raise ValueError(
-            f"labeler.kind=demonstrator answers with {length} steps of what was shown{where}, and there are none: set "
-            "labeler.data or labeler.expert.episodes, or make task.segment_steps shorter"
+            f"labeler.kind=demonstrator answers with {length} steps of what was shown{where}, and there are none: "
+            f"{MORE}, or make task.segment_steps shorter"
         )
     at = int(rng.integers(starts.sum()))  # each piece is as probable as any other
     which = int(np.searchsorted(starts.cumsum(), at, side="right"))

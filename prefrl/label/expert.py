@@ -37,8 +37,9 @@ class ExpertSettings(Settings):
     name: str = Field("expert", min_length=1)
     """Who shows; kept with every answer."""
     policy: Path | None = None
-    """Whose actions they are: the folder of a run of control on this task, or a zip of stable-baselines3. Null for the
-    expert that is known for the task, which Pendulum-v1 has."""
+    """Whose actions they are: the folder of a run of control on this task whose policy is a perceptron, or a zip of
+    stable-baselines3's PPO, A2C or TRPO with an MlpPolicy. Null for the expert that is known for the task, which
+    Pendulum-v1 has."""
     episodes: int = Field(4, ge=0)
     """Whole episodes of the expert's own, shown before anything is asked; those that are there already count."""
     noise: float = Field(0.0, ge=0)

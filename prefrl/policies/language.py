@@ -241,7 +241,7 @@ class LanguagePolicy:
 
     def start_logp(self, responses: Responses, temperature: float | None = None) -> Tensor:
         """(B, L) log-probabilities under the starting policy, without gradients."""
-        self.check_room(int(responses.lengths().max()))
+        self.check_room(int(responses.lengths().max()), written=True)
         temperature = self.temperature if temperature is None else temperature
         with self._at_the_start(), enough_memory("learner.policy.chunk", self.part):
             return self._all_logp(self.start, responses, temperature)
@@ -292,13 +292,18 @@ class LanguagePolicy:
             # In place: the optimiser holds these very tensors.
             parameter.copy_(self.keeping.share(found, parameter))
 
-    def check_room(self, tokens: int, prompt: str = "") -> None:
-        """Raises `ValueError` where the model's context has no room for so many tokens."""
+    def check_room(self, tokens: int, prompt: str = "", written: bool = False) -> None:
+        """Raises `ValueError` where the model's context has no room for so many tokens; `written`: the response is
+        there already, and no setting shortens it."""
         context = context_of(self.model)
         if context is not None and tokens > context:
+            if written:
+                need, advice = "need", "shorten them or leave them out, or choose a model with a longer context"
+            else:
+                need, advice = "need up to", "leave that prompt out, or lower task.response_tokens"
             raise ValueError(
-                f"a prompt and its response{beginning(prompt)} need up to {tokens} tokens, and the model's context has "
-                f"{context}: leave that prompt out, or lower task.response_tokens"
+                f"a prompt and its response{beginning(prompt)} {need} {tokens} tokens, and the model's context has "
+                f"{context}: {advice}"
             )
 
     def _trained(self) -> dict[str, torch.nn.Parameter]:

@@ -118,11 +118,14 @@ def read(folder: Path, examples: bool = True) -> Record:
     missing: list[str] = []
     config = _config(folder / "config.yaml", missing)
     summary = _json(folder / "summary.json", dict, missing, "no round is over yet")
-    held_out = _json(folder / "held_out.json", dict, missing, "no reward model has been fitted yet")
+    rounds = _rounds(folder / "metrics.jsonl", missing)
+    fitted = any(number(line.get("fit/loss")) is not None for line in rounds)
+    why = "nothing could be held out" if fitted else "no reward model has been fitted yet"
+    held_out = _json(folder / "held_out.json", dict, missing, why)
     return Record(
         name=visible(folder.resolve().name, 200),
         summary=summary,
-        rounds=_rounds(folder / "metrics.jsonl", missing),
+        rounds=rounds,
         config=visible(config, MAX_CONFIG),
         planned=whole(_setting(config, "loop").get("rounds")),
         imagined=_setting(config, "select").get("imagined") is True,

@@ -47,6 +47,8 @@ def label(
         raise RunError(f"{folder} holds a run, which asks for its own labels: choose another folder")
     with Store(folder) as store:
         loop = config.build(store)
+        for note in config.notes():
+            tell(note)
         _keep_config(config, folder)  # what cannot be built is not kept: a mistake can be corrected in the same folder
         if policy is not None:
             loop.learner.load(load_state(policy.folder, "learner"))

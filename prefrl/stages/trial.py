@@ -31,6 +31,9 @@ def estimate(config: Config, tell: Tell = lambda _: None) -> Spent:
     small = small.model_copy(update={"task": config.task, "learner": learner})
     with tempfile.TemporaryDirectory() as scratch, Store(Path(scratch)) as store:
         loop = small.build(store)
+        loop.check_shown()
+        for note in config.notes():
+            tell(note)
         for note in loop.task.notes if isinstance(loop.task, Noted) else ():
             tell(note)
         start, one = (round.metrics for round in loop.run())

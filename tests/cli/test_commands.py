@@ -341,6 +341,7 @@ def test_a_mistake_can_be_corrected_in_the_same_folder(prefrl: Shell) -> None:
 
 def test_demonstrations_may_go_where_a_mistake_left_nothing_but_a_folder(prefrl: Shell) -> None:
     assert prefrl("demonstrate control/pendulum --episodes 1 --expert nobody --out shown") == 2
+    assert "--expert: there is no nobody" in prefrl.err
     assert prefrl("demonstrate control/pendulum --episodes 1 --out shown") == 0
     assert prefrl("demonstrate control/pendulum --episodes 1 --out shown") == 2
     assert "shown holds answers already" in prefrl.err

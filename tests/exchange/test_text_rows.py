@@ -191,7 +191,7 @@ def test_a_completion_without_a_label_is_a_demonstration_and_is_written_so(
 ) -> None:
     rows: list[Mapping[str, Any]] = [
         {"prompt": "p", "completion": "c", "weight": 2.0},
-        {"prompt": [Q], "completion": [YES], "labeler": "ann"},
+        {"messages": [Q, YES], "labeler": "ann"},
     ]
     assert import_judgements(lines(tmp_path / "in.jsonl", *rows), text_store).read == 2
     shown = [(one.like.prompt, one.like.text) for one in text_store.demonstrations()]
@@ -204,6 +204,31 @@ def test_a_completion_without_a_label_is_a_demonstration_and_is_written_so(
     assert (done.written, done.dropped) == (2, {"annotator's name": 2, "time of an answer": 2})
     dropped = export(text_store, tmp_path / "pairs.jsonl", "preferences").dropped
     assert dropped["demonstration"] == 2
+
+
+def test_the_assistants_last_words_are_the_completion() -> None:
+    system = {"role": "system", "content": "s"}
+    (shown,) = one({"messages": [system, Q, YES, Q, NO]}).query.candidates
+    assert shown.prompt == "System: s\n\nHuman: q\n\nAssistant: yes\n\nHuman: q\n\nAssistant: "
+    assert shown.text == "no"
+    rated = one({"messages": [Q, YES], "label": False})
+    assert isinstance(rated.answer, Rating)
+    assert rated.query.id == one({"prompt": [Q], "completion": [YES]}).query.id
+
+
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        ([Q], "column 'messages': .* got user"),
+        ([YES], "column 'messages': .* got assistant"),
+        ([Q, YES, Q], "column 'messages': .* got user, assistant, user"),
+        ([Q, YES, NO], "ends with the assistant's words leaves it unclear"),
+        ("q", "expected a list of messages"),
+    ],
+)
+def test_a_conversation_without_a_last_word_of_the_assistant_is_refused(messages: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        one({"messages": messages})
 
 
 @pytest.mark.parametrize("label", [{"label": None}, {"good": False}, {"Label": True}])

@@ -185,7 +185,7 @@ def test_without_anything_shown_it_is_refused_before_anybody_is_asked(tmp_path: 
     for name in ("keep=0.1", "epochs=2"):
         config = Config.load("control/toy", [f"learner.clone.{name}"])
         with pytest.raises(ConfigError, match=r"learner\.clone learns from demonstrations, and there are none"):
-            config.build(store)
+            config.build(store).check_shown()
     with pytest.raises(ValueError, match=r"there are none: set learner\.clone\.data"):
         learner({"keep": 0.1}).improve(Known(), store, np.random.default_rng(0))
     with pytest.raises(ConfigError, match=r"learner\.clone\.data: .*expected an \.npz"):

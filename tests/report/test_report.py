@@ -380,6 +380,14 @@ def test_hostile_text_is_shown_and_not_obeyed(tmp_path: Path) -> None:
     assert ("meta", "content", CSP) in found.attributes  # a second lock: no script may run, nothing be loaded
 
 
+@pytest.mark.parametrize(
+    ("rounds", "why"), [(1, "no reward model has been fitted yet"), (2, "nothing could be held out")]
+)
+def test_why_nothing_was_held_out_is_said(tmp_path: Path, rounds: int, why: str) -> None:
+    record = read(run_folder(tmp_path / "run", [line(i) for i in range(rounds)]))
+    assert f"held_out.json: {why}" in record.missing
+
+
 WRONG = (None, -3, "x", [None], True, "[" * 100_000, {"total": [[1]]})
 
 
