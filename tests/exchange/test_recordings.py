@@ -101,7 +101,7 @@ def test_a_bundle_is_to_be_imported_first(tmp_path: Path) -> None:
         recording(tmp_path / "bundle")
 
 
-def minari_folder(path: Path, start: int = 0) -> Path:
+def minari_folder(path: Path, start: int = 0, form: str = "arrow") -> Path:
     """As Minari writes what an environment with discrete actions did: two episodes, of 2 steps and of 3."""
     pytest.importorskip("minari")
     from gymnasium.spaces import Box, Discrete
@@ -109,7 +109,7 @@ def minari_folder(path: Path, start: int = 0) -> Path:
     from minari.dataset.minari_storage import MinariStorage
 
     space = Box(-np.inf, np.inf, (2,), np.float32)
-    storage = MinariStorage.new(path.absolute(), space, Discrete(3, start=start), data_format="arrow")
+    storage = MinariStorage.new(path.absolute(), space, Discrete(3, start=start), data_format=form)
     for id, (first, last) in enumerate([(0, 2), (2, 5)]):
         steps = last - first
         episode = EpisodeBuffer(
@@ -124,9 +124,9 @@ def minari_folder(path: Path, start: int = 0) -> Path:
     return path
 
 
-@pytest.mark.parametrize("start", [0, 4])
-def test_discrete_actions_of_minari_are_one_hot_from_where_they_start(tmp_path: Path, start: int) -> None:
-    found = recording(minari_folder(tmp_path / "set", start))
+@pytest.mark.parametrize(("start", "form"), [(0, "arrow"), (4, "arrow"), (0, "hdf5")])
+def test_discrete_actions_of_minari_are_one_hot_from_where_they_start(tmp_path: Path, start: int, form: str) -> None:
+    found = recording(minari_folder(tmp_path / "set", start, form))
     assert found.bounds is None
     assert [len(one) for one in found.segments] == [2, 3]
     for one, taken in zip(found.segments, (TAKEN[:2], TAKEN[2:]), strict=True):
