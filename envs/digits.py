@@ -92,8 +92,8 @@ class Digits:
         return self.pixels.shape[1:]
 
     @property
-    def ungraded(self) -> tuple[str, ...]:
-        return tuple(caption for caption in self.captions if caption == MINE)
+    def ungraded(self) -> str:
+        return f"the caption {MINE}" if MINE in self.captions else ""
 
     def denoiser(self) -> Denoiser:
         return copy.deepcopy(self._start)

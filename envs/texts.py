@@ -145,6 +145,10 @@ class Texts:
     def evaluation_prompts(self, count: int, rng: np.random.Generator) -> list[str]:
         return _drawn(self.evaluating, count, rng, "to evaluate on (one in eight is)")
 
+    @property
+    def ungraded(self) -> str:
+        return "what is written to these prompts"
+
     def gold(self, responses: Sequence[Response]) -> Floats:
         """(N,) NaN: only people know."""
         return np.full(len(responses), np.nan, np.float32)

@@ -224,8 +224,9 @@ class Config(Settings):
             return
         if isinstance(task, PartlyGraded) and task.ungraded:
             raise ConfigError(
-                f"labeler.kind={self.labeler.model_dump()['kind']} goes by gold, and there is none for the captions "
-                f"{', '.join(task.ungraded)}: set labeler.kind=web to judge yourself, or ask for other captions"
+                f"labeler.kind={self.labeler.model_dump()['kind']} goes by gold, and there is none for "
+                f"{task.ungraded}: set labeler.kind=web to judge yourself, or a model that judges, or ask for what has "
+                "a gold"
             )
 
     def _check_imagined(self, learner: Learner, task: Task) -> None:

@@ -387,11 +387,11 @@ def pictures(task: Task, what: str) -> PictureTask:
 
 @runtime_checkable
 class PartlyGraded(Protocol):
-    """A task that knows no gold of some of what it asks for."""
+    """A task that knows no gold of some of what it asks for, or of anything."""
 
     @property
-    def ungraded(self) -> Sequence[str]:
-        """The captions that have none."""
+    def ungraded(self) -> str:
+        """What has none, in words; "" where everything has."""
 
 
 def caption_numbers(task: PictureTask, captions: Iterable[str]) -> list[int]:

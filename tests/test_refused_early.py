@@ -96,3 +96,11 @@ def test_what_was_judged_before_counts_for_those_who_learn_from_it(tmp_path: Pat
         store.answer([Comparison(query.id, 1.0, "ann")])
     with Run(Config.load("control/toy", few), tmp_path) as run:
         assert run.loop.round == -1
+
+
+def test_an_oracle_is_refused_where_nothing_has_a_gold(tmp_path: Path) -> None:
+    prompts = tmp_path / "prompts.jsonl"
+    prompts.write_text("".join(f'{{"prompt": "Tell me about number {i}."}}\n' for i in range(20)))
+    config = Config.load("text/replies", [f"task.prompts={prompts}", "labeler.kind=oracle", "loop.labels=2"])
+    with pytest.raises(ConfigError, match=r"oracle goes by gold, and there is none for what is written to these prom"):
+        Run(config, tmp_path / "run")

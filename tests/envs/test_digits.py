@@ -102,7 +102,7 @@ def test_who_goes_by_gold_is_not_asked_about_what_has_none(labeler: str) -> None
     shrunk = config.model_copy(update={"task": config.task.shrunk()})
     none = cast("Store[Picture]", None)
     with pytest.raises(
-        ConfigError, match=r"goes by gold, and there is none for the captions mine: set labeler.kind=web"
+        ConfigError, match=r"goes by gold, and there is none for the caption mine: set labeler.kind=web"
     ):
         shrunk.build(none)
     shrunk.model_copy(update={"loop": shrunk.loop.model_copy(update={"labels": 0})}).build(none)
