@@ -32,6 +32,12 @@ CAUSES: dict[str, dict[str, tuple[str, ...]]] = {
         "600 labels": ("loop.labels=600",),
         "worst of three heads": ("reward.combine.by=worst",),
     },
+    "what is maximised": {
+        BASE: (),
+        "win rate": ("learner.score=win_rate", "learner.beta=0.12"),
+        "log of the rank": ("learner.score=log_quantile", "learner.beta=0.14"),
+        "the same, 25 updates": ("learner.score=log_quantile", "learner.beta=0.14", "learner.updates=25"),
+    },
     "the learning rate": {
         "2e-4": ("learner.learning_rate=2e-4",),
         BASE: (),

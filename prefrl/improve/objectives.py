@@ -126,6 +126,18 @@ def win_rates(scores: Tensor) -> Tensor:
     return torch.where(_known(scores), won, math.nan)
 
 
+def log_quantiles(scores: Tensor, start: Tensor) -> Tensor:
+    """(B,) scores and (N,) scores of the starting policy's responses -> log of the share of those that each beats.
+
+    The start held at 1 / (n - 1) a nat to the optimum of this is the best of n (Sessa et al. 2024, BOND, section 3),
+    where scores are spread alike for all prompts: theirs are of each prompt. A tie counts half, and half a response is
+    below all others, so that every logarithm is finite.
+    """
+    ranked = start[_known(start)].sort().values
+    beaten = (torch.searchsorted(ranked, scores) + torch.searchsorted(ranked, scores, right=True)) / 2
+    return torch.where(_known(scores), torch.log((beaten + 0.5) / (len(ranked) + 1)), math.nan)
+
+
 def leave_one_out(scores: Tensor) -> Tensor:
     """(P, K) scores of K responses to each of P prompts, minus the mean of the other K - 1 (RLOO, Ahmadian 2024)."""
     if scores.shape[1] < 2:

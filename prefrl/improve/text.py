@@ -39,6 +39,7 @@ from prefrl.improve.objectives import (
     Objective,
     Reduction,
     kl_k1,
+    log_quantiles,
     masked_mean,
     masked_whiten,
     win_rates,
@@ -59,6 +60,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     | {"whiten": True},
 }
 """Defaults that differ from the fields below."""
+AT_START = 64, 8
+"""Prompts, and responses to each, that tell how the starting policy's scores are spread."""
 RATIO_TOLERANCE = {torch.float32: 0.01, torch.bfloat16: 1.0, torch.float16: 0.3}
 """In half precision a decoding step rounds otherwise than a pass over all tokens."""
 
@@ -124,9 +127,10 @@ class TextLearnerSettings(Settings):
     2025)."""
     length_cost: float = 0.0
     """Taken off the score for each token."""
-    score: Literal["raw", "win_rate"] = "raw"
-    """What is learned from: the score itself, or how often it is the higher one, s(its score - another's) in the mean
-    over a prompt's responses (`win_rate`, 0 to 1), which is another objective: see docs."""
+    score: Literal["raw", "win_rate", "log_quantile"] = "raw"
+    """What is learned from: the score itself; how often it is the higher one, s(its score - another's) in the mean over
+    a prompt's responses (`win_rate`, 0 to 1); or the log of the share of the start's responses that it beats
+    (`log_quantile`), whose optimum with beta = 1 / (n - 1) is the best of n. These are other objectives: see docs."""
     reward_clip: float | None = Field(None, gt=0)
     """A score is cut to this size, before anything is taken off it."""
     asked_responses: int = Field(4, ge=2)
@@ -210,6 +214,8 @@ class TextLearner:
         self._updates = 0
         self._reference: State = self.policy.state() if settings.reference_every else {}
         """What the policy's parameters are held near, where that moves."""
+        self._start_scores = torch.zeros(0)
+        """(N,) of the starting policy's responses by the newest reward: anew in each round that needs them."""
 
     @property
     def steps(self) -> Steps:
@@ -229,6 +235,9 @@ class TextLearner:
         seen: dict[str, list[float]] = defaultdict(list)
         if self._settings.critic.network == "reward" and not self._updates:
             start_from_reward(self.policy, reward)
+        if self._settings.score == "log_quantile":
+            written = self._writer.write_at_start(*AT_START, rng)
+            self._start_scores = self._shaped(self._scored(written, reward), written)
         for _ in self._writer.paced(range(self._settings.updates)):
             drawn = self._writer.write(self._settings.prompts, self._settings.responses, rng)
             measured = self._update(drawn, reward, rng)
@@ -266,11 +275,12 @@ class TextLearner:
     def _update(self, drawn: Responses, reward: RewardModel[Response], rng: np.random.Generator) -> Metrics:
         """Learn from one batch."""
         settings = self._settings
-        found = scored(reward, drawn.candidates(self._task.tokenizer))  # (B,)
-        raw = torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
+        raw = self._scored(drawn, reward)
         scores = finite("reward", self._shaped(raw, drawn), self._updates)  # NaN: what was not scored teaches nothing
         if settings.score == "win_rate":
             scores = win_rates(scores.view(-1, settings.responses)).flatten()
+        elif settings.score == "log_quantile":
+            scores = log_quantiles(scores, self._start_scores)
         reference = self._reference_logp(drawn)
         kl = torch.where(drawn.mask, kl_k1(drawn.logp, reference), 0.0)  # (B, L)
         batch, explained = self._batch(drawn, scores, kl)
@@ -342,6 +352,11 @@ class TextLearner:
         self.policy.check_share(min(map(len, found)))
         return found
 
+    def _scored(self, drawn: Responses, reward: RewardModel[Response]) -> Tensor:
+        """(B,) scores as the reward gives them."""
+        found = scored(reward, drawn.candidates(self._task.tokenizer))
+        return torch.as_tensor(found, dtype=torch.float32, device=self.policy.device)
+
     def _shaped(self, raw: Tensor, drawn: Responses) -> Tensor:
         """(B,): the scores that are learned from, NaN where there is none."""
         settings = self._settings
@@ -384,7 +399,7 @@ def _without_critic(settings: TextLearnerSettings) -> list[str]:
     in_reward = f" - {_beta(settings)} {apart}" if settings.beta and not after else ""
     index = "A_t" if settings.kl_in == "token" else "A_i"
     advantage = f"{index} = {ADVANTAGES[settings.advantage]}{after}{';  whitened' if settings.whiten else ''}"
-    if settings.score == "raw":
+    if settings.score != "win_rate":
         return [advantage, f"R_i = {_score(settings)}{in_reward}"]
     won = f"mean of s(x_i - x_j) over all of the prompt's {settings.responses},  s(d) = 1 / (1 + exp(-d))"
     return [advantage, f"R_i = w_i{in_reward},  w_i = {won}", f"x_i = {_score(settings)}"]
@@ -405,4 +420,7 @@ def _score(settings: TextLearnerSettings) -> str:
     cost = f" - {settings.length_cost:g} tokens(y_i)" if settings.length_cost else ""
     penalised = settings.missing_end_penalty and not settings.drop_unended
     end = f" - {settings.missing_end_penalty:g} [no end token]" if penalised else ""
-    return score + end + cost + (", of responses with an end token alone" if settings.drop_unended else "")
+    whole = score + end + cost
+    if settings.score == "log_quantile":
+        whole = f"log of the share of the start's responses that {whole} beats"
+    return whole + (", of responses with an end token alone" if settings.drop_unended else "")

@@ -82,6 +82,12 @@ class Writer:
         self.steps = self.steps.add(learn=drawn.count)
         return drawn
 
+    def write_at_start(self, prompts: int, each: int, rng: np.random.Generator) -> Responses:
+        """The same by the starting policy."""
+        drawn = self.policy.respond_at_start(self.policy.task.prompts(prompts, rng), each, rng)
+        self.steps = self.steps.add(learn=drawn.count)
+        return drawn
+
     def paced(self, turns: Sequence[T]) -> Iterator[T]:
         """A round's turns, each with the learning rate that the schedule has for it."""
         for number, turn in enumerate(turns):

@@ -218,11 +218,20 @@ class LanguagePolicy:
 
         `sampling`: otherwise than by the policy's own temperature.
         """
+        return self._written(self.model, prompts, sampling or self.sampling(samples), rng)
+
+    def respond_at_start(self, prompts: Sequence[str], samples: int, rng: np.random.Generator) -> Responses:
+        """The same of the starting policy."""
+        with self._at_the_start():
+            return self._written(self.start, prompts, self.sampling(samples), rng)
+
+    def _written(
+        self, model: PreTrainedModel, prompts: Sequence[str], sampling: Sampling, rng: np.random.Generator
+    ) -> Responses:
         encoded = [self.opened(prompt) for prompt in prompts]
-        sampling = sampling or self.sampling(samples)
-        running, fast = self.keeping.running(self.model), self.keeping.fast
+        running, fast, samples = self.keeping.running(model), self.keeping.fast, sampling.samples
         with enough_memory("learner.policy.at_once", self._at_once):
-            drawn = generate(self.model, encoded, sampling, generator(rng), fast, self._at_once, running)
+            drawn = generate(model, encoded, sampling, generator(rng), fast, self._at_once, running)
         # In the order of the generated rows: all samples of the first prompt first.
         repeated = [(p, e) for p, e in zip(prompts, encoded, strict=True) for _ in range(samples)]
         texts, ids = zip(*repeated, strict=True)

@@ -252,6 +252,21 @@ def test_win_rates_by_hand() -> None:
     assert float(found[0].mean()) == pytest.approx(0.5)  # what one wins another loses
 
 
+def test_log_quantiles_by_hand() -> None:
+    nan = float("nan")
+    found = o.log_quantiles(torch.tensor([0.0, 2.0, 5.0, nan]), torch.tensor([3.0, nan, 1.0, 2.0]))
+    torch.testing.assert_close(found.exp(), torch.tensor([0.5 / 4, 2.0 / 4, 3.5 / 4, nan]), equal_nan=True)
+
+
+@pytest.mark.parametrize("n", [2, 8])
+def test_the_optimum_for_log_quantiles_is_the_best_of_n(n: int) -> None:
+    scores = torch.randn(4000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    tilted = ((n - 1) * o.log_quantiles(scores, scores)).softmax(0)  # the start is uniform on these, beta = 1 / (n - 1)
+    share = torch.arange(4001, dtype=torch.float64) / 4000
+    best = torch.empty(4000, dtype=torch.float64).scatter_(0, scores.argsort(), (share**n).diff())
+    assert float((tilted - best).abs().sum()) < 2e-3  # twice the total variation
+
+
 def test_what_was_not_scored_is_in_no_baseline() -> None:
     """By hand: as if it were not there."""
     scores = torch.tensor([[1.0, 3.0, math.nan], [math.nan, 5.0, math.nan]])

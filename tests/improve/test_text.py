@@ -515,6 +515,8 @@ def test_the_formula_says_what_the_settings_say() -> None:
 def test_the_formula_says_what_is_done_to_a_score() -> None:
     shaped = text_formula(TextLearnerSettings(drop_unended=True, length_cost=0.1, reward_clip=2.0, beta=0.0))
     assert "R_i = clip(score(y_i), +-2) - 0.1 tokens(y_i), of responses with an end token alone" in shaped
+    ranked = text_formula(TextLearnerSettings(score="log_quantile", missing_end_penalty=0.5))
+    assert "R_i = log of the share of the start's responses that score(y_i) - 0.5 [no end token] beats - " in ranked
     token = text_formula(TextLearnerSettings(kl_in="token", beta=0.1, whiten=True))
     assert "log pi(y_t) A_t" in token
     assert "- 0.1 K_t,  K_t = sum_(s >= t) [log pi_old(y_s) - log ref(y_s)];  whitened" in token

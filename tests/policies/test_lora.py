@@ -57,6 +57,15 @@ def test_the_start_is_the_model_without_its_adapters(toy_reviews: Reviews, rng: 
     assert len(one.parameters()) == 14  # one layer has seven matrices; two for each
 
 
+@pytest.mark.parametrize("train", ["lora", "full"])
+def test_the_start_writes_what_it_wrote_before_anything_was_learned(toy_reviews: Reviews, train: str) -> None:
+    rng, prompts = np.random.default_rng, toy_reviews.prompts(3, np.random.default_rng(0))
+    fresh = LanguagePolicy(toy_reviews, 1.0, LanguageSettings(), rng(0)).respond(prompts, 4, rng(1))
+    one = improved(toy_reviews, policy={"train": train}, score="log_quantile").policy
+    assert torch.equal(one.respond_at_start(prompts, 4, rng(1)).tokens, fresh.tokens)
+    assert not torch.equal(one.respond(prompts, 4, rng(1)).tokens, fresh.tokens)
+
+
 def test_adapters_change_nothing_at_first_and_only_they_are_kept(toy_reviews: Reviews) -> None:
     fresh = learner(toy_reviews)
     drawn = some(fresh.policy, np.random.default_rng(0))
