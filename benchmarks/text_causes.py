@@ -138,7 +138,7 @@ def gains(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def draw(rows: list[dict[str, Any]]) -> Figure:
-    """A panel for each cause, a line for each change: small dots are seeds, large ones their means."""
+    """A panel for each cause, a line for each change: small dots are seeds, large ones and bars their means."""
     causes = [cause for cause in CAUSES if any(r["cause"] == cause for r in rows)]
     figure = Figure(figsize=(11, 2.3 * -(-len(causes) // 2)), layout="constrained")
     axes = figure.subplots(-(-len(causes) // 2), 2, sharex=True, squeeze=False).ravel()
@@ -150,6 +150,10 @@ def draw(rows: list[dict[str, Any]]) -> Figure:
                 gaps = [r[measure] - r[f"best_{measure}"] for r in own if r["change"] == change]
                 ax.plot(gaps, [y + shift] * len(gaps), ".", color=colour, markersize=5, alpha=0.5)
                 ax.plot(np.mean(gaps), y + shift, "o", color=colour, label=measure if y == 0 else None)
+                if measure == "gold":
+                    best = [r["optimum_gold"] - r["best_gold"] for r in own if r["change"] == change]
+                    label = "gold of the optimum for raw scores" if y == 0 else None
+                    ax.plot(np.mean(best), y + shift, "|", color="0.2", markersize=11, markeredgewidth=2, label=label)
         kls = {c: np.mean([r["kl"] for r in own if r["change"] == c]) for c in labels}
         ax.set_yticks(range(len(labels)), [f"{c}\n{kls[c]:.2f} nats" for c in reversed(labels)])
         ax.set(ylim=(-0.5, len(labels) - 0.5))
@@ -157,11 +161,11 @@ def draw(rows: list[dict[str, Any]]) -> Figure:
         ax.axvline(0, color="0.3", linewidth=1, linestyle="--")
         ax.grid(axis="x", color="0.93")
         ax.spines[["top", "right"]].set_visible(False)
+        ax.set_xlabel("less best-of-n, at equal KL", fontsize=8)
+        ax.tick_params(labelsize=8, labelbottom=True)
     for ax in axes[len(causes) :]:
-        ax.set_visible(False)
-    axes[0].legend(frameon=False, loc="lower left")
-    for ax in axes[-2:]:
-        ax.set_xlabel("learner less best-of-n, at equal KL")
+        ax.set_axis_off()
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, loc="lower right")
     return figure
 
 
