@@ -197,7 +197,7 @@ class ControlSettings(Settings):
     def _own_options(self, accepted: list[str]) -> dict[str, Any]:
         """The environment's own keyword arguments. Raises `ConfigError` for one that it does not have."""
         for name in self.options:
-            if name == "render_mode":
+            if name == "render_mode" and self.options[name] is not None:
                 raise ConfigError("task.options: leave render_mode out; clips are drawn where a person asks for them")
             if name not in accepted:
                 raise ConfigError(f"task.options: {self.env} has no option {name!r}; {suggest(name, accepted)}")
