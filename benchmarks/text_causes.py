@@ -75,13 +75,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--only", nargs="+", choices=tuple(CAUSES), default=list(CAUSES), metavar="CAUSE")
     parser.add_argument("--out", type=Path, default=Path("runs/causes"))
-    parser.add_argument("--to", type=Path, default=Path("docs/curves/text_causes"))
+    parser.add_argument("--to", type=Path, help="docs/curves/text_causes, or beside the runs where they are small")
     parser.add_argument("--short", action="store_true", help="a small run of two changes")
     options = parser.parse_args()
     size = SHORT if options.short else Size(prompts=64, pool=64)
+    to = options.to or (options.out / "short" if options.short else Path("docs/curves/text_causes"))
     seeds = range(options.first, options.first + (1 if options.short else options.seeds))
     asked = options.only[:1] if options.short else options.only
-    table, rows = options.to.with_suffix(".csv"), read(options.to.with_suffix(".csv"))
+    table, rows = to.with_suffix(".csv"), read(to.with_suffix(".csv"))
     for seed in seeds:
         for cause in asked:
             for change in list(CAUSES[cause])[: 2 if options.short else None]:
@@ -92,7 +93,7 @@ def main() -> None:
                 rows.append(found | {"cause": cause})
                 write(rows, table)
                 print(json.dumps(rows[-1]), flush=True)
-    draw(rows).savefig(options.to.with_suffix(".svg"), metadata={"Date": None}, facecolor="white")
+    draw(rows).savefig(to.with_suffix(".svg"), metadata={"Date": None}, facecolor="white")
     print(json.dumps({"name": f"text_causes: {TASK}", "unit": "gold", "gains": gains(rows), "short": options.short}))
 
 

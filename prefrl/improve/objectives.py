@@ -129,9 +129,9 @@ def win_rates(scores: Tensor) -> Tensor:
 def log_quantiles(scores: Tensor, start: Tensor) -> Tensor:
     """(B,) scores and (N,) scores of the starting policy's responses -> log of the share of those that each beats.
 
-    The start held at 1 / (n - 1) a nat to the optimum of this is the best of n (Sessa et al. 2024, BOND, section 3),
-    where scores are spread alike for all prompts: theirs are of each prompt. A tie counts half, and half a response is
-    below all others, so that every logarithm is finite.
+    At a price of 1 / (n - 1) a nat its optimum is the best of n (Sessa et al. 2024, BOND), where scores are spread
+    alike for all prompts: in the paper the share is of each prompt's own. A tie counts half, and half a response is
+    taken to lie below all others, so that every logarithm is finite.
     """
     ranked = start[_known(start)].sort().values
     beaten = (torch.searchsorted(ranked, scores) + torch.searchsorted(ranked, scores, right=True)) / 2
