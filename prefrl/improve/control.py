@@ -34,7 +34,8 @@ from prefrl.policies.flow import NEITHER, FlowPolicy, FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.maps import MapsPolicySettings
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings
-from prefrl.policies.origin import starting_state
+from prefrl.policies.origin import Owned, starting_state
+from prefrl.policies.remembering import RememberingPolicy
 from prefrl.policies.rollout import collect, joined, learned_rewards, step_rewards
 from prefrl.policies.transformer import TransformerPolicySettings
 from prefrl.protocols import ControlTask, RewardModel, StepRewardModel, Store, Task, simulated
@@ -156,11 +157,11 @@ class ControlLearnerSettings(Settings):
     @model_validator(mode="after")
     def _plain_start(self) -> ControlLearnerSettings:
         plain = MLPPolicySettings().model_dump(exclude=ITS_OWN).items()
-        flows = isinstance(self.policy, FlowPolicySettings)
-        if self.start is not None and not flows and not plain <= self.policy.model_dump().items():
+        owned = isinstance(self.policy, Owned)
+        if self.start is not None and not owned and not plain <= self.policy.model_dump().items():
             raise ValueError(
-                "start takes over a flow, or a policy of kind mlp with tanh and one width for actor and critic: leave "
-                f"learner.policy as it is, but for {', '.join(sorted(ITS_OWN))}"
+                "start takes over a flow, a gru, a transformer, or a policy of kind mlp with tanh and one width for "
+                f"actor and critic: leave learner.policy as it is, but for {', '.join(sorted(ITS_OWN))}"
             )
         return self
 
@@ -380,8 +381,8 @@ class ControlLearner:
     def _begin(self) -> None:
         """Take over the policy that this one starts from, once."""
         if self._start is not None:
-            assert isinstance(self._settings.policy, MLPPolicySettings | FlowPolicySettings)
-            assert isinstance(self.policy, MLPPolicy | FlowPolicy)
+            assert isinstance(self._settings.policy, MLPPolicySettings | Owned)
+            assert isinstance(self.policy, MLPPolicy | FlowPolicy | RememberingPolicy)
             self.policy.load(starting_state(self._start, self._task, self._settings.policy))
             # Few demonstrations show a part of the world: what lies elsewhere would change every scale at once.
             self.policy.freeze()

@@ -182,7 +182,7 @@ class Offline(Generic[P]):
         weights = {one.like.id: one.demonstration.weight for one in demonstrations}
         metrics = self._clone(material.segments, weights, rng) | self._improve(self, material, reward, rng)
         self._player.rounds += 1
-        # A flow's scores are no log-probabilities: of how judgements agree with it nothing is said.
+        # Scores are of single steps, and a flow's are no log-probabilities: of others than an mlp nothing is said.
         plain = isinstance(self.policy, MLPPolicy) and len(held)
         self._measured = _agreement(cast(Offline[MLPPolicy], self), held) if plain else {}
         return metrics
@@ -214,10 +214,10 @@ class Offline(Generic[P]):
         return act
 
     def save(self, path: Path) -> None:
-        """As a zip of stable-baselines3's PPO, which acts as this policy does. Raises ConfigError for a flow, of which
-        it has none."""
+        """As a zip of stable-baselines3's PPO, which acts as this policy does. Raises ConfigError for others than an
+        mlp, of which it has none."""
         if not isinstance(self.policy, MLPPolicy):
-            raise ConfigError(NO_ZIP.format("flow"))
+            raise ConfigError(NO_ZIP.format(self.policy.settings.kind))
         from prefrl.improve.to_sb3 import save_ppo  # stable-baselines3 takes a second to load
 
         save_ppo(self.policy, self._task, path)

@@ -163,12 +163,14 @@ def clone(
         drawn = replace(steps, inputs=policy.redrawn(steps.inputs, rng))
         found = update(policy, optimizer, drawn, rows, objective)
     # Of a std that stays, a density says nothing: against the mode's it is a distance.
-    return float(np.mean([one["loss"] for one in found])) + policy.ceiling * float(steps.advantages.double().mean())
+    each = steps.advantages.expand_as(steps.inputs.mask)[steps.inputs.mask]
+    return float(np.mean([one["loss"] for one in found])) + policy.ceiling * float(each.double().mean())
 
 
 def one_pass(steps: Batch[Any], size: int, rng: np.random.Generator) -> Iterator[Tensor]:
-    """All rows once, about `size` at a time."""
-    return (torch.from_numpy(at).to(steps.logp.device) for at in shuffled(len(steps), size, rng))
+    """All rows once, of about `size` steps at a time."""
+    rows = max(1, size // steps.inputs.mask.shape[1])
+    return (torch.from_numpy(at).to(steps.logp.device) for at in shuffled(len(steps), rows, rng))
 
 
 def again_and_again(steps: Batch[Any], size: int, rng: np.random.Generator) -> Iterator[Tensor]:
@@ -178,9 +180,11 @@ def again_and_again(steps: Batch[Any], size: int, rng: np.random.Generator) -> I
 
 def steps_of(shown: Shown, policy: Clonable[I]) -> Batch[I]:
     """Every step of the segments, one after another, as the policy sees it now; advantages are weights."""
-    each = np.repeat([shown.weights.get(one.id, 1.0) for one in shown.segments], [len(one) for one in shown.segments])
+    weights = [shown.weights.get(one.id, 1.0) for one in shown.segments]
+    each = np.repeat(weights, [-(-len(one) // policy.chunk) for one in shown.segments])
     advantages = torch.from_numpy(each.astype(np.float32)[:, None]).to(policy.device)
-    return Batch(policy.examples(shown.segments), torch.zeros_like(advantages), advantages)
+    inputs = policy.examples(shown.segments)
+    return Batch(inputs, torch.zeros_like(inputs.mask, dtype=torch.float32), advantages)
 
 
 def once(segments: Sequence[Segment]) -> list[Segment]:

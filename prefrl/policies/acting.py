@@ -80,8 +80,18 @@ class ControlPolicy(Policy[I], Protocol[I]):
         """Raises ValueError where shapes differ."""
 
 
+class Kinded(Protocol):
+    """Settings of a kind of policy."""
+
+    @property
+    def kind(self) -> str: ...
+
+
 class Clonable(ControlPolicy[I], Protocol[I]):
     """A policy that can be fitted on what was shown."""
+
+    @property
+    def settings(self) -> Kinded: ...
 
     @property
     def normaliser(self) -> Normaliser: ...
@@ -91,10 +101,10 @@ class Clonable(ControlPolicy[I], Protocol[I]):
         """The highest log-probability there can be, where that stays what it is; 0 where it does not."""
 
     def examples(self, segments: Sequence[Segment]) -> I:
-        """What was done in some segments: a sequence for each step, in order."""
+        """What was done in some segments: in order, each cut into sequences of `chunk` steps."""
 
     def redrawn(self, examples: I, rng: np.random.Generator) -> I:
-        """The same with new draws, for policies whose log-probabilities hang on some."""
+        """The same with new draws, or what is remembered now, for policies whose log-probabilities hang on such."""
 
 
 Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[Floats, Memory]]

@@ -182,6 +182,14 @@ def density(
     return -0.5 * (scaled**2).sum(-1, keepdim=True) - constant, entropy.expand(*outputs.shape[:-1], 1)
 
 
+def mode_density(log_std: Tensor | None) -> float:
+    """The log-density of the mode, which is the same in every state; 0 of discrete actions (None), that have none."""
+    if log_std is None:
+        return 0.0
+    assert log_std.dim() == 1  # not that of `sde`, which hangs on the state
+    return -float(log_std.detach().sum()) - 0.5 * len(log_std) * math.log(2 * math.pi)
+
+
 def starting_std(space: ActionSpace, settings: HeadSettings, features: int) -> dict[str, Tensor]:
     """The log standard deviations that a policy learns, in half the action bounds; none where actions are discrete.
 
@@ -285,5 +293,6 @@ __all__ = [
     "Slopes",
     "choose",
     "density",
+    "mode_density",
     "starting_std",
 ]

@@ -24,6 +24,7 @@ from prefrl.policies.heads import (
     Noise,
     choose,
     density,
+    mode_density,
     starting_std,
 )
 from prefrl.policies.normaliser import Normaliser, Scaling
@@ -184,10 +185,7 @@ class MLPPolicy:
     @property
     def peak(self) -> float:
         """The log-density of the mode, the same in every state without `sde`; 0 of discrete actions, that have none."""
-        if self.space.discrete:
-            return 0.0
-        assert not self.settings.sde
-        return -float(self.named()["log_std"].detach().sum()) - 0.5 * self.space.size * math.log(2 * math.pi)
+        return mode_density(self.named().get("log_std"))
 
     @property
     def ceiling(self) -> float:

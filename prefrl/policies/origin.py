@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 import yaml
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from prefrl.components import ConfigError, settings_class
 from prefrl.policies.flow import FlowPolicySettings
+from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.heads import ActionSpace
 from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings, NumpyActor
+from prefrl.policies.transformer import TransformerPolicySettings
 from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, squashes, state_of
 from prefrl.protocols import ControlTask, TaskSettings
 from prefrl.storage.checkpoints import load_state, newest
@@ -21,8 +23,13 @@ from prefrl.types import Json, State
 
 OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and PPO, A2C or TRPO"
 
-OF_NETWORKS = {"kind", "hidden", "critic_hidden", "activation", "chunk"}
-"""Settings of a flow that have to be alike for one to be taken over."""
+OF_NETWORKS = {
+    *("kind", "hidden", "critic_hidden", "activation", "chunk"),
+    *("width", "layers", "heads", "context", "squash", "sde"),
+}
+"""Settings of a flow, or of networks with a memory, that have to be alike for one to be taken over."""
+Owned: TypeAlias = FlowPolicySettings | GRUPolicySettings | TransformerPolicySettings
+"""Kinds of policies that are taken over from runs alone."""
 
 
 class _Found(NamedTuple):
@@ -33,14 +40,14 @@ class _Found(NamedTuple):
     """Of a run, the task that it is for; a zip does not say."""
 
 
-def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings | FlowPolicySettings) -> State:
-    """What `MLPPolicy.load` or `FlowPolicy.load` reads: the last policy of a run, or that of a zip (`read_zip`).
+def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings | Owned) -> State:
+    """What the policy's `load` reads: the last policy of a run, or for an mlp that of a zip (`read_zip`).
 
     Raises `ConfigError` for a policy of other spaces, widths or noise, and for what is no policy of control.
     """
     who = "learner.start"
-    if isinstance(settings, FlowPolicySettings):
-        return _flow(path, task, settings)
+    if not isinstance(settings, MLPPolicySettings):
+        return _owned(path, task, settings)
     found = _found(path, who)
     _check_spaces(found, path, task, who)
     _check_widths(found, path, settings.hidden)
@@ -69,22 +76,23 @@ def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
     return policy.numpy_actor()
 
 
-def _flow(folder: Path, task: ControlTask, settings: FlowPolicySettings) -> State:
-    """The flow of a run. Raises `ConfigError` where it is none, or another one."""
+def _owned(folder: Path, task: ControlTask, settings: Owned) -> State:
+    """The policy of a run. Raises `ConfigError` where it is of another kind, or another one."""
     if not folder.is_dir():
         raise ConfigError(
             f"learner.start: there is no {folder}, seen from {Path.cwd()}; expected the folder of a run with a policy "
-            "of kind flow"
+            f"of kind {settings.kind}"
         )
     checkpoint, _ = newest(folder)
     said = yaml.safe_load((checkpoint / "config.yaml").read_text(encoding="utf-8"))
     there, wanted = said["learner"].get("policy") or {}, settings.model_dump(mode="json")
     if there.get("kind") != settings.kind:
         raise ConfigError(
-            f"learner.start: the policy of {folder} is no flow: leave learner.policy.kind out, or name a run of a flow"
+            f"learner.start: expected a policy of kind {settings.kind}, and that of {folder} is of kind "
+            f"{there.get('kind', 'mlp')}: set learner.policy.kind to it, or name another run"
         )
     # How a plan is made and measured is no part of the network.
-    other = [name for name in sorted(OF_NETWORKS) if there.get(name) != wanted[name]]
+    other = [name for name in sorted(OF_NETWORKS & set(wanted)) if there.get(name) != wanted[name]]
     if other:
         theirs, here = ({name: said.get(name) for name in other} for said in (there, wanted))
         raise ConfigError(
@@ -180,4 +188,4 @@ def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
     return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
-__all__ = ["actor_of", "starting_state", "task_of"]
+__all__ = ["Owned", "actor_of", "starting_state", "task_of"]

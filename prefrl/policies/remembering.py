@@ -6,8 +6,9 @@ the network itself remembers at the chunk's first step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -15,12 +16,12 @@ import torch
 from torch import Tensor
 
 from prefrl.policies.acting import Decide, Memory, Reading, copy_into, in_chunks, on_device
-from prefrl.policies.heads import ActionSpace, HeadSettings, Noise, choose, density
+from prefrl.policies.heads import ActionSpace, HeadSettings, Noise, choose, density, mode_density
 from prefrl.policies.normaliser import Normaliser, Scaling
 from prefrl.policies.rollout import Rollout
-from prefrl.protocols import ControlTask
+from prefrl.protocols import ControlTask, Mapped
 from prefrl.seeding import to_numpy
-from prefrl.types import Bools, Floats, State
+from prefrl.types import Bools, Floats, Segment, State
 
 ACTOR, CRITIC, BOTH = slice(0, 1), slice(1, 2), slice(0, 2)
 """Which of the two networks, whose weights are stacked."""
@@ -90,8 +91,9 @@ class RememberingPolicy:
     ) -> None:
         """`p`: the weights of the networks, whose first layers are input_weight (2, O, out) and input_bias (2, 1, out),
         and of the heads on their features."""
-        self.chunk, self.space, self._settings = chunk, ActionSpace.of(task, settings), settings
-        self._networks, self._p = networks, p
+        self.chunk, self.space, self.settings = chunk, ActionSpace.of(task, settings), settings
+        self._networks, self._p, self._learns_std = networks, p, True
+        self._legal = task.legal if isinstance(task, Mapped) else None
         self.normaliser = Normaliser(task.observation_size, calm=True)
 
     @property
@@ -104,6 +106,16 @@ class RememberingPolicy:
     def parameters(self) -> Iterable[torch.nn.Parameter]:
         return self._p.values()
 
+    def freeze(self) -> None:
+        """See observations from now on as they are seen now."""
+        self.normaliser.frozen = True
+
+    def with_std_kept(self) -> RememberingPolicy:
+        """A view of the same weights that does not learn the standard deviation."""
+        view = copy(self)
+        view._learns_std = False
+        return view
+
     def observe(self, observations: Floats) -> None:
         move = self.normaliser.observe(observations)
         if move is not None:
@@ -113,7 +125,7 @@ class RememberingPolicy:
     def decide(self) -> Decide:
         step, size = self._networks.acting(self.normaliser.now()), self._networks.remembers
         weight, bias = to_numpy(self._p["actor_weight"]), to_numpy(self._p["actor_bias"])
-        noise = Noise(to_numpy(self._p["log_std"]), self._settings.sde_steps) if "log_std" in self._p else None
+        noise = Noise(to_numpy(self._p["log_std"]), self.settings.sde_steps) if "log_std" in self._p else None
 
         def decide(
             observations: Floats, rng: np.random.Generator | None, legal: Bools | None, memory: Memory, /
@@ -143,6 +155,35 @@ class RememberingPolicy:
         at_starts = known[:, 0:steps:length].flatten(0, 1)
         chunks = Chunks(cut[0], cut[1], allowed, cut[2], at_starts, cut[3])
         return Reading(chunks, self._values(features[1]).T, self._values(later)[0])
+
+    @property
+    def ceiling(self) -> float:
+        return 0.0 if self._learns_std else mode_density(self._p.get("log_std"))
+
+    def examples(self, segments: Sequence[Segment]) -> Chunks:
+        """Pieces of `chunk` steps, those of a segment one after another. It begins without a memory, wherever in its
+        episode it was cut from."""
+        normalise, device, cut = self.normaliser.now(), self.device, list[list[Tensor]]()
+        for one in segments:
+            first = np.arange(len(one)) == 0
+            legal = [] if self._legal is None else [self._legal(one.observations)]
+            arrays = normalise(one.observations), self.space.choices(one.actions), first, np.ones_like(first), *legal
+            cut.append([in_chunks(torch.from_numpy(x).to(device)[None], self.chunk) for x in arrays])
+        seen, choices, begins, mask, *legal = (torch.cat(pieces) for pieces in zip(*cut, strict=True))
+        known = self._networks.known(np.zeros((len(mask), self._networks.remembers), np.float32), normalise)
+        return Chunks(seen, choices, _some_legal(legal[0]) if legal else None, begins, known, mask)
+
+    @torch.no_grad()
+    def redrawn(self, examples: Chunks, rng: np.random.Generator) -> Chunks:
+        """The same, with what the network remembers now where a piece goes on with what the one before it began."""
+        known, goes_on = examples.known.clone(), torch.cat([~examples.begins[1:, 0], examples.begins.new_zeros(1)])
+        at = examples.begins[:, 0].nonzero()[:, 0]
+        while len(at := at[goes_on[at]]):
+            some = examples.rows(at)
+            _, after = self._networks.follow(some.observations, some.begins, known[at])
+            at = at + 1
+            known[at] = after[:, -1]
+        return replace(examples, known=known)
 
     def log_prob(self, inputs: Chunks) -> tuple[Tensor, Tensor]:
         (features,) = self._features(inputs, ACTOR)
@@ -179,7 +220,10 @@ class RememberingPolicy:
         """(L, B, F) of the actor -> (B, L) log-probabilities and entropies."""
         outputs = (features @ self._p["actor_weight"] + self._p["actor_bias"]).transpose(0, 1)
         seen = features.transpose(0, 1)
-        logp, entropies = density(outputs, inputs.choices, self._p.get("log_std"), inputs.legal, seen)
+        log_std = self._p.get("log_std")
+        if log_std is not None and not self._learns_std:
+            log_std = log_std.detach()
+        logp, entropies = density(outputs, inputs.choices, log_std, inputs.legal, seen)
         return torch.where(inputs.mask, logp.squeeze(-1), 0.0), torch.where(inputs.mask, entropies.squeeze(-1), 0.0)
 
 

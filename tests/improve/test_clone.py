@@ -16,6 +16,7 @@ from control_stubs import Known, point
 from prefrl import Config, Run, load_policy
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
+from prefrl.envs.toys import TMazeSettings, ToyTask
 from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
 from prefrl.improve.control import ControlLearnerSettings
@@ -25,6 +26,7 @@ from prefrl.improve.offline import Offline, Recordings
 from prefrl.improve.pairs import shuffled
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.expert import Advice, Expert, ExpertSettings
+from prefrl.policies.rollout import whole_episodes
 from prefrl.protocols import Store as Kept
 from prefrl.rundir import RunError
 from prefrl.stages import export_onnx, export_sb3
@@ -290,11 +292,16 @@ def test_only_what_was_shown_is_cloned_and_not_what_was_judged(tmp_path: Path) -
 
 
 FLOW: dict[str, Any] = {"kind": "flow", "hidden": [16], "critic_hidden": [4], "chunk": 2, "execute": 2, "draws": 2}
+GRU: dict[str, Any] = {"kind": "gru", "width": 8, "hidden": 8, "chunk": 7}
+TRANSFORMER: dict[str, Any] = {"kind": "transformer", "width": 8, "heads": 2, "hidden": 8, "context": 6}
 
 
-def test_a_flow_is_cloned_alike_from_the_same_seed_and_goes_on_alike_after_a_stop(tmp_path: Path) -> None:
+@pytest.mark.parametrize("policy", [FLOW, GRU, TRANSFORMER], ids=lambda x: x["kind"])
+def test_other_policies_are_cloned_alike_from_the_same_seed_and_go_on_alike_after_a_stop(
+    tmp_path: Path, policy: dict[str, Any]
+) -> None:
     task, store = point(), shown(tmp_path, point(), to_the_middle, episodes=4)
-    changes = {"policy": FLOW, "cloning_epochs": 40, "learning_rate": 1e-2}
+    changes = {"policy": policy, "cloning_epochs": 40 if policy is FLOW else 10, "learning_rate": 1e-2}
     one, same = (CloneSettings.model_validate(changes).build(task, np.random.default_rng(0)) for _ in range(2))
     first = one.improve(cast(Any, Known()), store, np.random.default_rng(0))
     same.load(deepcopy(one.state()))
@@ -303,6 +310,75 @@ def test_a_flow_is_cloned_alike_from_the_same_seed_and_goes_on_alike_after_a_sto
     assert second[0]["cloning_loss"] < first["cloning_loss"]
     for name, weights in one.policy.state()["parameters"].items():
         assert torch.equal(weights, same.policy.state()["parameters"][name])
+
+
+def walks(task: ToyTask, count: int) -> tuple[Segment, ...]:
+    """Episodes in a T-maze of one who saw the sign, and turns by it."""
+    envs = task.environments(count)
+    observations = envs.reset(np.random.default_rng(0))
+    sign, steps = observations[:, 0], list[tuple[Floats, Floats]]()
+    for left in reversed(range(task.horizon)):
+        turn = np.where(sign < 0, 1, 2) if left == 0 else np.zeros(count, int)
+        steps.append((observations, np.eye(3, dtype=np.float32)[turn]))
+        observations = envs.step(steps[-1][1]).observations
+    seen, done = (np.stack(x, 1) for x in zip(*steps, strict=True))
+    return tuple(Segment(seen[i], done[i], episode=f"walk/{i}", start=0) for i in range(count))
+
+
+@pytest.mark.parametrize(("policy", "gold"), [(None, 0.5), (GRU, 1.0), (TRANSFORMER, 1.0)])
+def test_a_clone_with_a_memory_does_what_hangs_on_an_earlier_step(policy: dict[str, Any] | None, gold: float) -> None:
+    task = TMazeSettings(length=6).build()
+    changes = {"policy": policy, "cloning_epochs": 40, "cloning_minibatch": 48, "learning_rate": 1e-2, "hidden": [16]}
+    one = CloneSettings.model_validate(changes).build(task, np.random.default_rng(0))
+    one._data = walks(task, 16)
+    one.improve(cast(Any, Known()), cast(Any, None), np.random.default_rng(0))
+    rollout = whole_episodes(task, one._act(None), 40, np.random.default_rng(1))
+    # Who does not remember turns one way, and half of the signs say the other one.
+    assert float(rollout.gold.sum(1).mean()) == pytest.approx(gold, abs=0.25 if policy is None else 0.01)
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_the_std_of_a_clone_with_a_memory_is_the_learners_and_is_learned_where_that_is_said(learns: bool) -> None:
+    task, states = point(), np.linspace(-1, 1, 20, dtype=np.float32)[:, None]
+    one = CloneSettings.model_validate({"policy": GRU, "std": 0.3, "learn_std": learns, "cloning_epochs": 5}).build(
+        task, np.random.default_rng(0)
+    )
+    one._data = (Segment(states, to_the_middle(states), episode="known", start=0),)
+    metrics = one.improve(cast(Any, Known()), cast(Any, None), np.random.default_rng(0))
+    std = float(one.policy.named()["log_std"].detach().exp())
+    assert (std == pytest.approx(0.3)) is not learns
+    if not learns:  # the squared distance over twice the variance, in the mean over all steps of the last pass
+        assert 0 < metrics["cloning_loss"] < 1 / (2 * 0.3**2)
+
+
+@pytest.mark.parametrize("change", [{"initial_std": 0.5}, {"sde": True}])
+def test_what_says_again_how_noisy_a_clone_is_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"std and learn_std say how noisy a clone is: leave policy\.initial_std"):
+        CloneSettings.model_validate({"policy": GRU | change})
+
+
+def test_a_learner_goes_on_from_a_clone_with_a_memory_and_another_one_is_refused(tmp_path: Path) -> None:
+    gru = [f"learner.policy={json.dumps(GRU)}", "learner.cloning_epochs=1", "labeler.episodes=1"]
+    gru += ["learner.evaluation_episodes=1", "loop.rounds=1", "loop.labels=0"]
+    with Run(Config.load("control/fork-flow", gru), tmp_path / "clone") as run:
+        list(run)
+    settings = {"start": tmp_path / "clone", "policy": GRU}
+    task, seen = run.loop.task, np.random.default_rng(0).normal(0.0, 1.0, (20, 2)).astype(np.float32)
+    one = ControlLearnerSettings.model_validate(settings).build(task, np.random.default_rng(0))
+    expected, memory = load_policy(tmp_path / "clone").predict(seen)
+    assert memory is not None
+    one.policy.observe(seen)
+    found, _ = one.actor()(seen, None, None)
+    np.testing.assert_array_equal(found, expected)
+    for change, told in (
+        ({"width": 9}, r"has learner.policy \{'width': 8\}, and here they are \{'width': 9\}: set them alike"),
+        (TRANSFORMER, "expected a policy of kind transformer, and that of .* is of kind gru"),
+    ):
+        other = ControlLearnerSettings.model_validate(settings | {"policy": GRU | change})
+        with pytest.raises(ConfigError, match=told):
+            other.build(task, np.random.default_rng(0)).actor()
+    with pytest.raises(ConfigError, match=r"only hold a policy of kind mlp, .* kind gru.*load_policy"):
+        export_sb3(tmp_path / "clone", tmp_path / "policy.zip")
 
 
 def test_a_learner_starts_from_a_cloned_flow_and_what_cannot_hold_one_is_said(tmp_path: Path) -> None:

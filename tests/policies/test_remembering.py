@@ -12,6 +12,7 @@ from prefrl.policies.acting import Acting, forgotten, in_chunks
 from prefrl.policies.heads import density
 from prefrl.policies.loaded import Loaded
 from prefrl.policies.normaliser import CLIP, Normaliser
+from prefrl.types import Segment
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -113,3 +114,28 @@ def test_rows_are_cut_from_their_start_and_padded_at_their_end() -> None:
     found = in_chunks(torch.arange(10).view(2, 5), 3)
     assert found.tolist() == [[0, 1, 2], [3, 4, 0], [5, 6, 7], [8, 9, 0]]
     assert in_chunks(torch.arange(10).view(2, 5), 1).flatten().tolist() == list(range(10))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_demonstrations_are_read_in_pieces_as_the_policy_would_have_acted(kind: str) -> None:
+    """Of what it does itself every action has the density of the mode, whatever it remembers from earlier pieces."""
+    policy = made(PENDULUM, kind=kind)
+    seen = np.random.default_rng(6).normal(0.1, 0.2, (17, 3, PENDULUM.observation_size)).astype(np.float32)
+    act, none = Acting(policy.decide(), None), np.zeros(3, bool)
+    actions = np.stack([act(step, None, none)[1] for step in seen])
+    shown = [Segment(seen[:n, i], actions[:n, i], episode=f"{i}", start=0) for i, n in enumerate((17, 8, 3))]
+    examples = policy.examples(shown)
+    assert examples.mask.sum(1).tolist() == [4, 4, 4, 4, 1, 4, 4, 3]  # pieces of 4 steps
+    drawn = policy.redrawn(examples, np.random.default_rng(0))
+    logp = policy.with_std_kept().log_prob(drawn)[0][drawn.mask]
+    assert np.abs(actions).max() < 2  # none was cut off at the bounds
+    torch.testing.assert_close(logp, torch.full_like(logp, policy.with_std_kept().ceiling), atol=1e-4, rtol=0)
+    forgetful = policy.log_prob(examples)[0]
+    assert torch.equal(forgetful[5], policy.log_prob(drawn)[0][5])  # where a segment begins
+    assert (forgetful[6] < logp.min() - 1e-3).any()
+    # Weights that have moved remember otherwise.
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter += 0.1
+    again = policy.redrawn(examples, np.random.default_rng(0)).known
+    assert (kind == "transformer") == torch.equal(again, drawn.known)  # which remembers observations
