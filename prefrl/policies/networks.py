@@ -22,7 +22,16 @@ from prefrl.components import ConfigError, missing
 from prefrl.policies.acting import Actor, Memory
 from prefrl.policies.loaded import Bounds, Loaded
 from prefrl.policies.normaliser import CLIP, Scaling
-from prefrl.policies.zips import OTHERS, bounds_of, oddity, read_modules, read_words, read_zip, statistics_beside
+from prefrl.policies.zips import (
+    OTHERS,
+    bounds_of,
+    oddity,
+    read_modules,
+    read_words,
+    read_zip,
+    shape_of,
+    statistics_beside,
+)
 from prefrl.seeding import draw_seed
 from prefrl.types import Floats, Json, State
 
@@ -32,7 +41,6 @@ CLASSES = {
     "stable_baselines3.dqn.policies": "DQNPolicy",
     "stable_baselines3.sac.policies": "SACPolicy",
     "stable_baselines3.td3.policies": "TD3Policy",  # and DDPG
-    "sb3_contrib.ars.policies": "ARSPolicy",
     "sb3_contrib.common.recurrent.policies": "RecurrentActorCriticPolicy",
     "sb3_contrib.crossq.policies": "CrossQPolicy",
     "sb3_contrib.qrdqn.policies": "QRDQNPolicy",
@@ -151,7 +159,7 @@ def _kwargs(path: Path, said: Json, weights: Mapping[str, Any]) -> dict[str, Any
 def _seen(path: Path, words: Any) -> gymnasium.Space[Any]:
     """Observations. Of a Box the shape is what counts, and whether they are pictures."""
     words = words if isinstance(words, dict) else {}
-    kind, shape = str(words.get(":type:")), tuple(map(int, re.findall(r"\d+", str(words.get("_shape")))))
+    kind, shape = str(words.get(":type:")), shape_of(words)
     if "discrete.Discrete" in kind and str(words.get("start")) == "0":
         return gymnasium.spaces.Discrete(int(words["n"]))
     if "box.Box" not in kind or not shape:

@@ -194,8 +194,8 @@ def oddity(said: Json, weights: Mapping[str, Tensor]) -> str:
     if isinstance(kwargs, dict) and (kwargs.get("use_expln") or kwargs.get("full_std") is False):
         return f"{WANTED}, and this policy has use_expln, or not full_std"
     space = _words(said.get("observation_space"))
-    if "Box" not in space.get(":type:", "") or "," in space.get("_shape", ""):
-        return f"expected observations in one row of numbers (a Box), got {_told(space)}"
+    if "Box" not in space.get(":type:", "") or len(shape_of(said.get("observation_space"))) != 1:
+        return f"expected observations in one row of numbers (a Box), got {_told(said.get('observation_space'))}"
     return ""
 
 
@@ -209,8 +209,13 @@ def bounds_of(path: Path, space: Any) -> Bounds | None:
             raise ValueError("no Box")
         low, high = (np.array(re.sub(r"[\[\]]", " ", words[k]).split(), np.float32) for k in ("low", "high"))
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected actions of a Box or Discrete, got {_told(words)}; {OTHERS}") from error
+        raise ValueError(f"{path}: expected actions of a Box or Discrete, got {_told(space)}; {OTHERS}") from error
     return low, high
+
+
+def shape_of(space: Any) -> tuple[int, ...]:
+    """Of a space, by a zip's words, which are a list or, of earlier versions, the text of a tuple."""
+    return tuple(map(int, re.findall(r"\d+", str(space.get("_shape"))))) if isinstance(space, dict) else ()
 
 
 def _words(told: Any) -> dict[str, str]:
@@ -218,8 +223,8 @@ def _words(told: Any) -> dict[str, str]:
     return {k: v for k, v in told.items() if isinstance(v, str)} if isinstance(told, dict) else {}
 
 
-def _told(space: Mapping[str, str]) -> str:
-    return f"{space.get(':type:', 'nothing')} of shape {space.get('_shape', 'unknown')}"
+def _told(space: Any) -> str:
+    return f"{_words(space).get(':type:', 'nothing')} of shape {shape_of(space)}"
 
 
 def statistics_beside(path: Path, size: int) -> State | None:
@@ -256,6 +261,7 @@ __all__: Sequence[str] = (
     "read_modules",
     "read_words",
     "read_zip",
+    "shape_of",
     "squashes",
     "state_of",
     "statistics_beside",
