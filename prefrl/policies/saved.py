@@ -73,8 +73,8 @@ def acting(folder: Path, best: bool = False) -> tuple[Acts, ControlTask, int]:
     learner, round = _learned(folder, checkpoint, said, task, best)
     if not isinstance(learner, Acts):
         raise ValueError(
-            f"{folder}: learner.kind={said['learner']['kind']} has no policy to load: what to do is searched for in "
-            "each step, in the run's learned world; `prefrl evaluate` plays its episodes"
+            f"{folder}: learner.kind={said['learner']['kind']} has no policy to load: a planner searches for what to "
+            "do in each step, in the run's learned world; `prefrl evaluate` plays its episodes"
         )
     return learner, task, round
 
