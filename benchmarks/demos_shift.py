@@ -28,6 +28,7 @@ from prefrl.envs.fast.vectorised import Vectorised
 from prefrl.improve.clone import CloneSettings
 from prefrl.improve.offline import Offline
 from prefrl.label.expert import Expert, ExpertSettings
+from prefrl.policies.acting import forgetful
 from prefrl.store import Store
 from prefrl.types import Bools, Floats, Query, Segment
 
@@ -120,7 +121,7 @@ def learned(method: str, seed: int) -> Offline:
     settings = CloneSettings(hidden=(16,), cloning_epochs=epochs, learning_rate=1e-3, threads=1)
     learner = settings.build(cast(Any, world), rng)
     with tempfile.TemporaryDirectory() as folder, Store[Segment](folder) as store:
-        shows = Expert(ExpertSettings(episodes=4 if corrected else 20), cast(Any, world), advice)
+        shows = Expert(ExpertSettings(episodes=4 if corrected else 20), cast(Any, world), forgetful(advice))
         shows.answer(store, rng)
         learner.improve(cast(Any, None), store, rng)
         for _ in range(ROUNDS if corrected else 0):

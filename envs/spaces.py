@@ -142,6 +142,10 @@ class OwnSpaces:
         return found
 
     @property
+    def shape(self) -> tuple[int, ...] | None:
+        return self.observations.shape
+
+    @property
     def shown(self) -> str:
         size = gymnasium.spaces.flatdim(self.observations)
         hidden = f"without numbers {list(self.hide)} of the {size}, 0 to {size - 1}" if self.hide else ""

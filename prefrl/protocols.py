@@ -202,6 +202,10 @@ class Outside(Protocol):
     def shown(self) -> str:
         """In words, what the policy sees of an observation; empty where it sees just that."""
 
+    @property
+    def shape(self) -> tuple[int, ...] | None:
+        """Of an observation as the environment gives it; None where it is no array."""
+
     def rows(self, observations: Any) -> tuple[Floats, bool]:
         """One observation, or n as a vectorised environment gives them -> (n, O) what the policy sees, and whether it
         was one. Raises ValueError for what is no observation of the environment."""
@@ -446,13 +450,13 @@ class Demonstrates(Protocol):
 class Advises(Protocol):
     """A labeler that can tell what it would do in any state of control: a policy is measured beside it."""
 
-    @property
-    def advice(self) -> Callable[[Floats], Floats]:
+    def advice(self, observations: Floats) -> Floats:
         """Observations (n, O) -> actions (n, A), within the bounds, or one-hot."""
 
     @property
     def wavers(self) -> bool:
-        """Whether it does not do so in all of its own episodes, and so is no measure."""
+        """Whether what it does hangs on more than the state, and so is no measure: it goes one way or another in its
+        own episodes, or it has a memory."""
 
 
 @runtime_checkable

@@ -16,7 +16,7 @@ commands = typer.Typer()
 
 @commands.command()
 def record(
-    policy: Annotated[Path, typer.Argument(help="A run of control, or a zip of stable-baselines3's PPO.")],
+    policy: Annotated[Path, typer.Argument(help="A run of control, or a zip of stable-baselines3.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="An .mp4, .webm or .gif.")] = Path("video.mp4"),
     env: Annotated[str | None, typer.Option(help="Gymnasium's id; default: the run's own task.")] = None,
     episodes: Annotated[int, typer.Option(help="How many, one after another.", min=1)] = 3,

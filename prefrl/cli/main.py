@@ -170,7 +170,8 @@ def demonstrate(
     overrides: Overrides = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder that is written.")] = Path("demonstrations"),
     expert: Annotated[
-        Path | None, typer.Option(help="Who acts: a run of control, or a zip. Default: the task's own expert.")
+        Path | None,
+        typer.Option(help="Who acts: a run of control, or a zip of any algorithm. Default: the task's own expert."),
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, help="How many whole episodes are shown.")] = 4,
     noise: Annotated[

@@ -30,6 +30,7 @@ from prefrl.improve.sb3_start import take_over
 from prefrl.improve.vec_env import LearnedReward, TaskEnv, executed
 from prefrl.policies.acting import Actor, Memory, played
 from prefrl.policies.loaded import check_leaves
+from prefrl.policies.networks import predicted
 from prefrl.policies.rollout import Act, Rollout, step_rewards
 from prefrl.protocols import ControlTask, RewardModel, Store, Task, simulated
 from prefrl.seeding import Device, device_of, draw_seed
@@ -352,13 +353,8 @@ class SB3:
 
     def _chosen(self, observations: Floats, memory: Memory, deterministic: bool) -> tuple[Floats, Memory]:
         """(n, O) and (n, M) -> (n, A) actions to execute, and what is remembered now, if anything."""
-        state, count = None, len(observations)
-        if memory is not None:
-            layers = self.model.policy.lstm_actor.num_layers
-            state = tuple(memory.reshape(count, 2, layers, -1).transpose(1, 2, 0, 3))  # 2 x (layers, n, H)
-        chosen, state = self.model.predict(observations, state, deterministic=deterministic)
-        after = None if state is None else np.stack(state).transpose(2, 0, 1, 3).reshape(count, -1)
-        return executed(self._env.action_space, chosen), after
+        chosen, memory = predicted(self.model, self.model.policy, observations, memory, deterministic)
+        return executed(self._env.action_space, chosen), memory
 
 
 @contextmanager

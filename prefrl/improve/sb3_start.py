@@ -10,19 +10,17 @@ import torch
 import yaml
 
 from prefrl.components import ConfigError
-from prefrl.policies.origin import task_of
+from prefrl.policies.loaded import Bounds, bounds_told, same_bounds
+from prefrl.policies.saved import task_of
 from prefrl.policies.zips import (
-    Bounds,
     activation_of,
     bounds_of,
-    bounds_told,
     read_modules,
     read_words,
-    same_bounds,
     squashes,
     statistics_beside,
 )
-from prefrl.protocols import ControlTask
+from prefrl.protocols import ControlTask, control
 from prefrl.storage.checkpoints import load_state, newest
 from prefrl.types import State
 
@@ -106,7 +104,8 @@ def _of_run(folder: Path, name: str, wanted: str, task: ControlTask) -> _Found:
         came = ", ".join(f"learner.{key}={learner[key]}" for key in ("kind", "algorithm") if key in learner)
         export = f" (of a run of control `prefrl export {folder} --form sb3 --to policy.zip` makes a zip of PPO)"
         raise ValueError(f"expected {wanted}; {folder} is a run with {came}{export if name == 'PPO' else ''}")
-    _check_bounds(task_of(said).action_bounds, folder, task)
+    there = control(task_of(said), f"{folder}: expected a run of a control task")
+    _check_bounds(there.action_bounds, folder, task)
     state = load_state(checkpoint, "learner")
     return _Found(state["modules"], state["variables"], "", squashes(learner))
 

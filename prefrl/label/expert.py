@@ -3,6 +3,10 @@
 Variant: DAgger (Ross et al. 2011, algorithm 3.1) with the expert alone in control of its own first episodes and the
 learner alone from then on (their beta_i = I(i = 1)); noise as in DART (Laskey et al. 2017) with a fixed width. Left
 out: mixtures of both within one episode, and noise that is fitted to the learner's errors.
+
+An expert with a memory (what a recurrent network carries on, or the plan that a flow is in) remembers an episode of its
+own from the first step on. What came before a segment of the learner's is not known: there it remembers from the
+segment's first step on, which is exact where the episode begins with the segment, and an approximation elsewhere.
 """
 
 from __future__ import annotations
@@ -18,14 +22,15 @@ from pydantic import Field
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.experts import EXPERTS, MOODS
 from prefrl.judgements import Demonstration
-from prefrl.policies.origin import actor_of
+from prefrl.policies.acting import Actor, Memory, forgetful, played
 from prefrl.policies.rollout import whole_episodes
+from prefrl.policies.saved import expert
 from prefrl.protocols import ControlTask, Store, Task, simulated
 from prefrl.sample.segments import placed, segment
 from prefrl.types import Bools, Floats, Integers, Query, Segment
 
 Advice: TypeAlias = Callable[[Floats], Floats]
-"""Observations (n, O) -> the expert's actions (n, A), within the bounds, or one-hot."""
+"""Observations (n, O) -> the actions (n, A) of an expert without a memory, within the bounds, or one-hot."""
 Moods: TypeAlias = Callable[[Floats, Floats], Floats]
 """The same of an expert who does not act alike in all episodes: it is also given (n,) in [0, 1), drawn for each."""
 
@@ -37,8 +42,9 @@ class ExpertSettings(Settings):
     name: str = Field("expert", min_length=1)
     """Who shows; kept with every answer."""
     policy: Path | None = None
-    """Whose actions they are: the folder of a run of control on this task whose policy is a perceptron, or a zip of
-    stable-baselines3's PPO, A2C or TRPO with an MlpPolicy. Null for the expert that is known for the task, which
+    """Whose actions they are: the folder of a run of control on this task, or a zip of stable-baselines3 or
+    sb3-contrib; whatever `prefrl.load_policy` acts with, and by its mode. An expert with a memory that corrects a
+    segment remembers from the segment's first step on. Null for the expert that is known for the task, which
     Pendulum-v1 has."""
     episodes: int = Field(4, ge=0)
     """Whole episodes of the expert's own, shown before anything is asked; those that are there already count."""
@@ -52,8 +58,12 @@ class ExpertSettings(Settings):
             raise ConfigError(
                 f"labeler.noise: of discrete actions it is a share, so expected at most 1, got {self.noise}"
             )
-        moods = MOODS.get(found.name) if self.policy is None else None
-        return Expert(self, found, advice_of(self.policy, found), moods)
+        if self.policy is None:
+            return Expert(self, found, forgetful(known(found)), MOODS.get(found.name))
+        actor = expert(self.policy, found, "labeler.policy").actor
+        # It is asked once, for an answer says whether it remembers; and who cannot act is known before the run.
+        _, memory = actor(found.environments(1).reset(np.random.default_rng(0)), None, None)
+        return Expert(self, found, actor, remembers=memory is not None)
 
 
 @dataclass(frozen=True)
@@ -62,9 +72,12 @@ class Expert:
 
     settings: ExpertSettings
     task: ControlTask
-    advice: Advice
+    actor: Actor
+    """What it does; no generator is given to it."""
     moods: Moods | None = None
     """In its own episodes, where these are not all alike."""
+    remembers: bool = False
+    """Whether what it does hangs on what it saw before."""
     demonstrates: bool = True
     corrects: bool = True
 
@@ -74,7 +87,11 @@ class Expert:
 
     @property
     def wavers(self) -> bool:
-        return self.moods is not None
+        return self.moods is not None or self.remembers
+
+    def advice(self, observations: Floats) -> Floats:
+        """(n, O) -> (n, A), where it remembers nothing."""
+        return self.actor(observations, None, None)[0]
 
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Show the episodes, once, then answer every open query with what the expert does in its states."""
@@ -89,7 +106,7 @@ class Expert:
         missing = self.settings.episodes - self._already(store)
         if missing <= 0:
             return
-        played = play(self.task, self.advice, missing, rng, self.settings, self.moods)
+        played = play(self.task, self.actor, missing, rng, self.settings, self.moods)
         queries = [Query((one,)) for one in played]
         store.ask(queries)
         # In the same order, so that a round that was killed in between, and is done again, goes on from there.
@@ -108,14 +125,21 @@ class Expert:
                 "in the states of one: set select.candidates=1, or let another labeler answer"
             )
         (own,) = query.candidates
-        return replace(own, actions=self.advice(own.observations).astype(np.float32), gold=None)
+        right = self._followed(own.observations) if self.remembers else self.advice(own.observations)
+        return replace(own, actions=right.astype(np.float32), gold=None)
+
+    def _followed(self, observations: Floats) -> Floats:
+        """(T, O) of a segment -> (T, A), with what is remembered from its first step on."""
+        memory: Memory = None
+        actions = []
+        for now in observations:
+            action, memory = self.actor(now[None], None, memory)
+            actions.append(action[0])
+        return np.stack(actions)
 
 
-def advice_of(policy: Path | None, task: ControlTask) -> Advice:
-    """The mode of a saved policy, or the expert known for the task. Raises `ConfigError` where there is none."""
-    if policy is not None:
-        actor = actor_of(policy, task, "labeler.policy")
-        return lambda observations: actor(observations, None)[1]
+def known(task: ControlTask) -> Advice:
+    """The expert known for a task. Raises `ConfigError` where there is none."""
     if task.name not in EXPERTS:
         raise ConfigError(
             f"labeler.policy: no expert is known for {task.name}, only for {', '.join(EXPERTS)}: name a run of control "
@@ -133,7 +157,7 @@ def advice_of(policy: Path | None, task: ControlTask) -> Advice:
 
 def play(
     task: ControlTask,
-    advice: Advice,
+    actor: Actor,
     episodes: int,
     rng: np.random.Generator,
     settings: ExpertSettings,
@@ -141,11 +165,12 @@ def play(
 ) -> Sequence[Segment]:
     """Whole episodes in which the expert acts, with noise, and which hold what it would have done without."""
     noise, mood = np.random.default_rng(rng.integers(2**63)), np.zeros(episodes)
+    acting = played(actor, None)
 
     def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
         if moods is not None:
             mood[begins] = noise.random(int(begins.sum()))
-        clean = advice(observations) if moods is None else moods(observations, mood)
+        clean = acting(observations, legal, begins)[0] if moods is None else moods(observations, mood)
         return clean, _disturbed(clean, task, settings.noise, noise, legal)
 
     rollout = whole_episodes(task, act, episodes, rng)

@@ -112,6 +112,11 @@ Actor: TypeAlias = Callable[[Floats, np.random.Generator | None, Memory], tuple[
 the policy's mode, or drawn where there is a generator."""
 
 
+def forgetful(act: Callable[[Floats], Floats]) -> Actor:
+    """Who does (n, A) where it sees (n, O), whatever came before, and draws nothing."""
+    return lambda observations, rng, memory: (act(observations), memory)
+
+
 class Acting:
     """An `Act` of a policy, with what it remembers of the episodes that it is in."""
 
@@ -218,6 +223,7 @@ __all__ = [
     "Reading",
     "allowed",
     "copy_into",
+    "forgetful",
     "forgotten",
     "in_chunks",
     "on_device",

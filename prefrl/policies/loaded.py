@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,17 +15,28 @@ from prefrl.policies.rollout import Act
 from prefrl.protocols import ControlTask, OfEnvironment, Outside, Task
 from prefrl.types import Floats
 
+Bounds: TypeAlias = tuple[Floats, Floats]
+"""(low (A,), high (A,)) of actions."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Loaded:
     """Acts like a policy of stable-baselines3, so that what evaluates those evaluates this one."""
 
     actor: Actor
     observation_size: int
     action_size: int
-    discrete: bool
+    bounds: Bounds | None
+    """None where actions are discrete."""
     outside: Outside | None = None
     """What the environment itself shows and takes; None where that is what the policy sees and does."""
+    shape: tuple[int, ...] = ()
+    """Of the environment's observations, for a policy that was made for other ones than rows of numbers; `actor` sees
+    them as rows all the same."""
+
+    @property
+    def discrete(self) -> bool:
+        return self.bounds is None
 
     def act(self, rng: np.random.Generator | None) -> Act:
         """For rollouts: what is drawn from `rng`, or the policy's mode; in episodes that are yet to begin."""
@@ -32,12 +44,17 @@ class Loaded:
 
     def check(self, task: ControlTask, name: str) -> None:
         """Raises `ConfigError` for a task of other spaces; `name` says whose policy this is."""
-        here = task.observation_size, task.action_size, task.action_bounds is None
-        if (self.observation_size, self.action_size, self.discrete) != here:
+        sizes, here = (self.observation_size, self.action_size), (task.observation_size, task.action_size)
+        if sizes != here or not same_bounds(self.bounds, task.action_bounds):
             raise ConfigError(
-                f"{name}: expected a policy for {task.name}, with {_told(*here)}; this one has "
-                f"{_told(self.observation_size, self.action_size, self.discrete)}: take another policy, or the task "
-                "that it was made for"
+                f"{name}: expected a policy for {task.name}, with {_told(*here, task.action_bounds)}; this one has "
+                f"{_told(*sizes, self.bounds)}: take another policy, or the task that it was made for"
+            )
+        found = outside(task)
+        if self.shape and found is not None and found.shape != self.shape:
+            raise ConfigError(
+                f"{name}: expected a policy for {task.name}, whose observations have the shape {found.shape}; this one "
+                f"was made for {self.shape}: take another policy, or wrap the environment so that it shows these"
             )
 
     def predict(
@@ -56,7 +73,7 @@ class Loaded:
         `episode_start` (n,): for whom nothing before counts. `rng`: what is drawn from where the policy is not
         `deterministic`. Raises ValueError for other observations.
         """
-        rows, one = plain_rows(observation) if self.outside is None else self.outside.rows(observation)
+        rows, one = self._rows(observation)
         if rows.ndim != 2 or rows.shape[1] != self.observation_size:
             size, shape = self.observation_size, np.shape(observation)
             seen = f" ({self.outside.shown})" if self.outside is not None and self.outside.shown else ""
@@ -70,6 +87,27 @@ class Loaded:
         else:
             found = actions.argmax(1) if self.discrete else actions
         return (found[0] if one else found), state
+
+    def _rows(self, observation: Any) -> tuple[Floats, bool]:
+        """(n, O), and whether it was one."""
+        if self.outside is not None:
+            return self.outside.rows(observation)
+        shape = np.shape(observation)
+        if self.shape and shape[-len(self.shape) :] == self.shape:
+            rows = np.asarray(observation, np.float32).reshape(-1, math.prod(self.shape))
+            return rows, shape == self.shape
+        return plain_rows(observation)
+
+
+def same_bounds(a: Bounds | None, b: Bounds | None) -> bool:
+    """Of actions; None for discrete ones."""
+    if a is None or b is None:
+        return a is b
+    return all(np.shape(x) == np.shape(y) and np.allclose(x, y, rtol=1e-6) for x, y in zip(a, b, strict=True))
+
+
+def bounds_told(bounds: Bounds | None) -> str:
+    return "discrete actions" if bounds is None else f"actions from {bounds[0].tolist()} to {bounds[1].tolist()}"
 
 
 def plain_rows(observations: Any) -> tuple[Floats, bool]:
@@ -95,8 +133,8 @@ def check_leaves(task: ControlTask) -> None:
         )
 
 
-def _told(seen: int, acts: int, discrete: bool) -> str:
-    return f"observations of {seen} numbers and {acts} {'discrete actions' if discrete else 'numbers in an action'}"
+def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
+    return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
-__all__ = ["Actor", "Loaded", "check_leaves", "outside", "plain_rows"]
+__all__ = ["Actor", "Bounds", "Loaded", "bounds_told", "check_leaves", "outside", "plain_rows", "same_bounds"]

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias
 
-import numpy as np
 import yaml
 from torch import Tensor
 
-from prefrl.components import ConfigError, settings_class
+from prefrl.components import ConfigError
 from prefrl.policies.flow import FlowPolicySettings
 from prefrl.policies.gru import GRUPolicySettings
 from prefrl.policies.heads import ActionSpace
-from prefrl.policies.mlp import MLPPolicy, MLPPolicySettings, NumpyActor
+from prefrl.policies.loaded import Bounds, bounds_told, same_bounds
+from prefrl.policies.mlp import MLPPolicySettings
+from prefrl.policies.saved import task_of
 from prefrl.policies.transformer import TransformerPolicySettings
-from prefrl.policies.zips import Bounds, bounds_told, read_zip, same_bounds, squashes, state_of
-from prefrl.protocols import ControlTask, TaskSettings
+from prefrl.policies.zips import read_zip, squashes, state_of
+from prefrl.protocols import ControlTask, control
 from prefrl.storage.checkpoints import load_state, newest
-from prefrl.types import Json, State
+from prefrl.types import State
 
 OURS = "a run of control with learner.kind=control, or with learner.kind=sb3 and PPO, A2C or TRPO"
 
@@ -36,8 +37,6 @@ class _Found(NamedTuple):
     state: State
     bounds: Bounds | None
     squash: bool
-    env: str = ""
-    """Of a run, the task that it is for; a zip does not say."""
 
 
 def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings | Owned) -> State:
@@ -45,35 +44,13 @@ def starting_state(path: Path, task: ControlTask, settings: MLPPolicySettings | 
 
     Raises `ConfigError` for a policy of other spaces, widths or noise, and for what is no policy of control.
     """
-    who = "learner.start"
     if not isinstance(settings, MLPPolicySettings):
         return _owned(path, task, settings)
-    found = _found(path, who)
-    _check_spaces(found, path, task, who)
+    found = _found(path)
+    _check_spaces(found, path, task)
     _check_widths(found, path, settings.hidden)
     _check_noise(found, path, settings)
     return found.state
-
-
-def actor_of(path: Path, task: ControlTask, who: str) -> NumpyActor:
-    """What acts as the policy of a run or of a zip does, whatever its widths; `who` names the setting that wants it.
-
-    Raises `ConfigError` as `starting_state` does.
-    """
-    found = _found(path, who)
-    if found.env not in ("", task.name):
-        raise ConfigError(
-            f"{who}: expected an expert for {task.name}, and {path} is a run of {found.env}: name another one"
-        )
-    _check_spaces(found, path, task, who)
-    parameters: Mapping[str, Tensor] = found.state["parameters"]
-    actor, critic = (tuple(_sizes(parameters, net)[1:-1]) for net in ("actor", "critic"))
-    log_std = parameters.get("log_std")
-    sde = log_std is not None and log_std.dim() == 2
-    settings = MLPPolicySettings(hidden=actor, critic_hidden=critic, squash=found.squash, sde=sde)
-    policy = MLPPolicy(settings, task, np.random.default_rng(0))  # its weights are written over
-    policy.load(found.state)
-    return policy.numpy_actor()
 
 
 def _owned(folder: Path, task: ControlTask, settings: Owned) -> State:
@@ -105,13 +82,15 @@ def _owned(folder: Path, task: ControlTask, settings: Owned) -> State:
     return state
 
 
-def _found(path: Path, who: str) -> _Found:
+def _found(path: Path) -> _Found:
     if not path.exists():
-        raise ConfigError(f"{who}: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip")
+        raise ConfigError(
+            f"learner.start: there is no {path}, seen from {Path.cwd()}; expected the folder of {OURS}, or a zip"
+        )
     try:
         return _of_run(path) if path.is_dir() else _of_zip(path)
     except ValueError as error:
-        raise ConfigError(f"{who}: {error}") from error
+        raise ConfigError(f"learner.start: {error}") from error
 
 
 def _of_zip(path: Path) -> _Found:
@@ -130,26 +109,21 @@ def _of_run(folder: Path) -> _Found:
         raise ConfigError(f"{folder} has a policy of kind {named}; expected kind mlp with tanh")
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
         raise ConfigError(f"{folder} holds no policy of control that can be taken over; expected {OURS}")
-    task, squash = task_of(said), squashes(said["learner"])
+    task = control(task_of(said), f"{folder}: expected a run of a control task")
+    squash = squashes(said["learner"])
     space = ActionSpace.within(task.action_size, task.action_bounds, squash)
-    return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash, task.name)
+    return _Found(ours if "mean" in ours else state_of(theirs, space), task.action_bounds, squash)
 
 
-def task_of(said: Json) -> ControlTask:
-    """The task of a run, from its saved settings."""
-    settings = settings_class("tasks", said["task"]["kind"]).model_validate(said["task"])
-    return cast(ControlTask, cast(TaskSettings, settings).build())
-
-
-def _check_spaces(found: _Found, path: Path, task: ControlTask, who: str) -> None:
+def _check_spaces(found: _Found, path: Path, task: ControlTask) -> None:
     sizes = _sizes(found.state["parameters"], "actor")
     seen, acts = sizes[0], sizes[-1]
     if (seen, acts) != (task.observation_size, task.action_size) or not same_bounds(found.bounds, task.action_bounds):
         here = _told(task.observation_size, task.action_size, task.action_bounds)
         came = _told(seen, acts, found.bounds)
         raise ConfigError(
-            f"{who}: expected a policy for {task.name}, with {here}; {path} has one with {came}: take another one, or "
-            "choose the task that it was made for"
+            f"learner.start: expected a policy for {task.name}, with {here}; {path} has one with {came}: take another "
+            "one, or choose the task that it was made for"
         )
 
 
@@ -188,4 +162,4 @@ def _told(seen: int, acts: int, bounds: Bounds | None) -> str:
     return f"observations of {seen} numbers and {acts} {bounds_told(bounds)}"
 
 
-__all__ = ["Owned", "actor_of", "starting_state", "task_of"]
+__all__ = ["Owned", "starting_state"]

@@ -13,20 +13,19 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from prefrl.policies.heads import ActionSpace, Noise
-from prefrl.policies.loaded import Loaded
+from prefrl.policies.loaded import Bounds, Loaded
 from prefrl.policies.mlp import NumpyActor
 from prefrl.policies.normaliser import CLIP, Scaling
 from prefrl.seeding import to_host, to_numpy
 from prefrl.types import Floats, Json, State
 
-Bounds: TypeAlias = tuple[Floats, Floats]
 WANTED = "expected a zip of stable-baselines3's PPO, A2C or TRPO with an MlpPolicy"
 VERSION = "_stable_baselines3_version"
 OTHERS = "load it with stable-baselines3 in a script of your own"
@@ -80,7 +79,7 @@ class Zipped:
             lambda observations, rng, memory: (actor(observations, rng)[1], memory),
             self.observation_size,
             self.space.size,
-            self.space.discrete,
+            self.bounds,
         )
 
 
@@ -120,7 +119,8 @@ def read_zip(path: Path) -> Zipped:
     """
     said, version = read_words(path, WANTED)
     weights = _weights(path, version)
-    _check(path, said, weights)
+    if odd := oddity(said, weights):
+        raise ValueError(f"{path}: {odd}; {OTHERS}")
     found = Zipped(weights, bounds_of(path, said.get("action_space")))
     sizes = found.space.size, found.observation_size
     if found.bounds is not None and found.bounds[0].shape != (sizes[0],):
@@ -180,22 +180,23 @@ def activation_of(said: Json, default: str) -> str:
     return found[-1] if found else default
 
 
-def _check(path: Path, said: Json, weights: Mapping[str, Tensor]) -> None:
-    """Raises `ValueError` for what is no plain perceptron with tanh over a row of numbers."""
+def oddity(said: Json, weights: Mapping[str, Tensor]) -> str:
+    """In words, why a policy is no plain perceptron with tanh over a row of numbers; empty where it is one."""
     known = re.compile(r"(mlp_extractor\.(policy|value)_net\.\d+|action_net|value_net)\.(weight|bias)|log_std")
     strange = sorted(name for name in weights if not known.fullmatch(name))
     if strange or not _hidden_layers(weights, "policy_net") or not _hidden_layers(weights, "value_net"):
         came = f"a layer {strange[0]!r}" if strange else "no hidden layers"
-        raise ValueError(f"{path}: {WANTED}, and this policy has {came}; {OTHERS}")
+        return f"{WANTED}, and this policy has {came}"
     activation = activation_of(said, "Tanh")
     if activation != "Tanh":
-        raise ValueError(f"{path}: expected a policy with tanh, and this one has {activation}; {OTHERS}")
+        return f"expected a policy with tanh, and this one has {activation}"
     kwargs = said.get("policy_kwargs")
     if isinstance(kwargs, dict) and (kwargs.get("use_expln") or kwargs.get("full_std") is False):
-        raise ValueError(f"{path}: {WANTED}, and this policy has use_expln, or not full_std; {OTHERS}")
+        return f"{WANTED}, and this policy has use_expln, or not full_std"
     space = _words(said.get("observation_space"))
-    if "Box" not in space.get(":type:", "") or "," in space.get("_shape", ""):
-        raise ValueError(f"{path}: expected observations in one row of numbers (a Box), got {_told(space)}; {OTHERS}")
+    if "Box" not in space.get(":type:", "") or len(shape_of(said.get("observation_space"))) != 1:
+        return f"expected observations in one row of numbers (a Box), got {_told(said.get('observation_space'))}"
+    return ""
 
 
 def bounds_of(path: Path, space: Any) -> Bounds | None:
@@ -208,19 +209,13 @@ def bounds_of(path: Path, space: Any) -> Bounds | None:
             raise ValueError("no Box")
         low, high = (np.array(re.sub(r"[\[\]]", " ", words[k]).split(), np.float32) for k in ("low", "high"))
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected actions of a Box or Discrete, got {_told(words)}; {OTHERS}") from error
+        raise ValueError(f"{path}: expected actions of a Box or Discrete, got {_told(space)}; {OTHERS}") from error
     return low, high
 
 
-def same_bounds(a: Bounds | None, b: Bounds | None) -> bool:
-    """Of actions; None for discrete ones."""
-    if a is None or b is None:
-        return a is b
-    return all(np.shape(x) == np.shape(y) and np.allclose(x, y, rtol=1e-6) for x, y in zip(a, b, strict=True))
-
-
-def bounds_told(bounds: Bounds | None) -> str:
-    return "discrete actions" if bounds is None else f"actions from {bounds[0].tolist()} to {bounds[1].tolist()}"
+def shape_of(space: Any) -> tuple[int, ...]:
+    """Of a space, by a zip's words, which are a list or, of earlier versions, the text of a tuple."""
+    return tuple(map(int, re.findall(r"\d+", str(space.get("_shape"))))) if isinstance(space, dict) else ()
 
 
 def _words(told: Any) -> dict[str, str]:
@@ -228,8 +223,8 @@ def _words(told: Any) -> dict[str, str]:
     return {k: v for k, v in told.items() if isinstance(v, str)} if isinstance(told, dict) else {}
 
 
-def _told(space: Mapping[str, str]) -> str:
-    return f"{space.get(':type:', 'nothing')} of shape {space.get('_shape', 'unknown')}"
+def _told(space: Any) -> str:
+    return f"{_words(space).get(':type:', 'nothing')} of shape {shape_of(space)}"
 
 
 def statistics_beside(path: Path, size: int) -> State | None:
@@ -262,11 +257,11 @@ __all__: Sequence[str] = (
     "Zipped",
     "activation_of",
     "bounds_of",
-    "bounds_told",
+    "oddity",
     "read_modules",
     "read_words",
     "read_zip",
-    "same_bounds",
+    "shape_of",
     "squashes",
     "state_of",
     "statistics_beside",

@@ -14,6 +14,7 @@ from prefrl.components import ConfigError
 from prefrl.envs.several import SeveralSettings, SeveralTask
 from prefrl.label.demonstrator import Demonstrator
 from prefrl.label.expert import ExpertSettings, play
+from prefrl.policies.acting import forgetful
 from prefrl.sample.segments import piece
 from prefrl.store import Store
 from prefrl.types import Floats, Query, Segment
@@ -107,7 +108,7 @@ def test_what_was_shown_in_a_task_answers_queries_of_that_task_alone(tmp_path: P
     def waits(observations: Floats) -> Floats:
         return np.eye(3, dtype=np.float32)[np.zeros(len(observations), int)]
 
-    shown = play(task, waits, 4, rng, ExpertSettings())
+    shown = play(task, forgetful(waits), 4, rng, ExpertSettings())
     assert {one.context for one in shown} == {"car", "arm"}
     with Store[Segment](tmp_path) as store:
         own = [replace(piece(one, 2, 3), actions=one.actions[2:5] * 0 + [0, 1, 0]) for one in shown]

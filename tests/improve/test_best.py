@@ -157,7 +157,7 @@ def test_stable_baselines3_has_a_best_policy_too(tmp_path: Path) -> None:
 def test_a_learner_that_keeps_none_has_no_best_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Run(shrink(Config.load("control/toy")), tmp_path / "run") as run:
         list(run)
-    monkeypatch.setattr("prefrl.stages.policies.Settles", bytes)  # which no learner is
+    monkeypatch.setattr("prefrl.policies.saved.Settles", bytes)  # which no learner is
     with pytest.raises(RunError, match=r"learner \(ControlLearner\) keeps no best policy"):
         evaluate(tmp_path / "run", best=True)
 

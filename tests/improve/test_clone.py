@@ -26,6 +26,7 @@ from prefrl.improve.offline import Offline, Recordings
 from prefrl.improve.pairs import shuffled
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.expert import Advice, Expert, ExpertSettings
+from prefrl.policies.acting import forgetful
 from prefrl.policies.rollout import whole_episodes
 from prefrl.protocols import Store as Kept
 from prefrl.rundir import RunError
@@ -53,7 +54,7 @@ def learner(task: GymnasiumTask, seed: int = 0, **settings: object) -> Offline:
 
 def shown(folder: Path, task: GymnasiumTask, advice: Advice, **settings: object) -> Kept[Segment]:
     store = Store[Segment](folder)
-    Expert(ExpertSettings.model_validate(settings), task, advice).answer(store, np.random.default_rng(1))
+    Expert(ExpertSettings.model_validate(settings), task, forgetful(advice)).answer(store, np.random.default_rng(1))
     return store
 
 
@@ -138,7 +139,7 @@ def test_corrections_in_its_own_states_are_learned_with_what_was_shown(tmp_path:
 
     before = error()
     store.ask([Query((Segment(left, np.zeros((20, 1), np.float32), "own", 0),))])
-    Expert(ExpertSettings(episodes=0), task, to_the_middle).answer(store, np.random.default_rng(1))
+    Expert(ExpertSettings(episodes=0), task, forgetful(to_the_middle)).answer(store, np.random.default_rng(1))
     one.improve(cast(Any, Known()), store, np.random.default_rng(0))
     assert before > 0.5
     assert error() < 0.15

@@ -19,6 +19,7 @@ from prefrl.improve.clone import CloneSettings
 from prefrl.judgements import Comparison, Demonstration
 from prefrl.label.demonstrator import DemonstratorSettings
 from prefrl.label.expert import Expert, ExpertSettings, _disturbed, play
+from prefrl.policies.acting import forgetful
 from prefrl.protocols import ControlTask
 from prefrl.rundir import Run
 from prefrl.store import Store
@@ -77,8 +78,8 @@ def test_the_learners_states_are_answered_with_the_experts_actions(pendulum: Con
 
 
 def test_noise_is_executed_and_the_clean_actions_are_shown(pendulum: ControlTask) -> None:
-    noisy = play(pendulum, swing_up, 2, np.random.default_rng(0), ExpertSettings(noise=0.5))
-    clean = play(pendulum, swing_up, 2, np.random.default_rng(0), ExpertSettings())
+    noisy = play(pendulum, forgetful(swing_up), 2, np.random.default_rng(0), ExpertSettings(noise=0.5))
+    clean = play(pendulum, forgetful(swing_up), 2, np.random.default_rng(0), ExpertSettings())
     for one, other in zip(noisy, clean, strict=True):
         # To the rounding of observations that went through a batch of another shape.
         np.testing.assert_allclose(one.actions, swing_up(one.observations), atol=1e-6)
@@ -89,7 +90,7 @@ def test_noise_is_executed_and_the_clean_actions_are_shown(pendulum: ControlTask
 def test_a_round_that_was_killed_while_showing_shows_the_same_again(pendulum: ControlTask, tmp_path: Path) -> None:
     who = expert(pendulum, episodes=2)
     with Store[Segment](tmp_path) as store:
-        played = play(pendulum, who.advice, 2, np.random.default_rng(7), who.settings)
+        played = play(pendulum, who.actor, 2, np.random.default_rng(7), who.settings)
         store.ask([Query((one,)) for one in played])
         who.answer(store, np.random.default_rng(7))
         assert len(store.demonstrations()) == 2

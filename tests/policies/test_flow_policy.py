@@ -127,7 +127,7 @@ def test_new_statistics_do_not_change_what_the_policy_does() -> None:
 def test_a_loaded_policy_takes_its_plan_back_and_answers_alike_to_one_observation() -> None:
     learner = ControlLearnerSettings(policy=FlowPolicySettings(**SMALL)).build(TASK, np.random.default_rng(0))
     learner.policy.load(made().state())
-    policy = Loaded(learner.actor(), 2, 2, discrete=False)
+    policy = Loaded(learner.actor(), 2, 2, TASK.action_bounds)
     first, state = policy.predict([0.1, 0.2])
     second, state = policy.predict([0.5, -0.2], state)
     assert state is not None

@@ -64,7 +64,7 @@ def loaded(task: GymnasiumTask, action: Floats, seen: list[Floats] | None = None
             seen.append(observations)
         return np.tile(action, (len(observations), 1)), memory
 
-    return Loaded(act, task.observation_size, task.action_size, task.action_bounds is None, outside(task))
+    return Loaded(act, task.observation_size, task.action_size, task.action_bounds, outside(task))
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_a_loaded_policy_takes_its_memory_back_as_those_of_stable_baselines3_do(
     settings = ControlLearnerSettings(policy=KINDS[kind])
     learner = settings.build(task, np.random.default_rng(0))
     learner.policy.load(made(task, kind=kind).state())
-    policy = Loaded(learner.actor(), task.observation_size, task.action_size, task.action_bounds is None)
+    policy = Loaded(learner.actor(), task.observation_size, task.action_size, task.action_bounds)
     first, state = policy.predict([0.1, 0.2])
     second, state = policy.predict([0.1, -0.2], state)
     third, _ = policy.predict([0.1, 0.2], state)
