@@ -63,8 +63,11 @@ def test_of_equal_lengths_whole_numbers_are_discrete_as_well_and_more_than_were_
         ({"action_count": 2}, "actions: expected whole numbers from 0 to 1, got 0 to 2"),
         ({"action_count": np.array([3])}, r"action_count: expected one whole number, got int64 of shape \(1,\)"),
         ({"actions": TAKEN + 10**8}, "actions: expected whole numbers from 0 to 9999"),
-        ({"observations": np.where(SEEN == 6, np.nan, SEEN)}, r"x\.npz: observations, episode 2 is nan in step 1"),
-        ({"actions": np.full((5, 1), np.inf)}, "actions, episode 1 is inf in step 0"),
+        (
+            {"observations": np.where(SEEN == 6, np.nan, SEEN)},
+            r"x\.npz: episode 2: array observations is nan in",
+        ),
+        ({"actions": np.full((5, 1), np.inf)}, "episode 1: array actions is inf in step 0"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_its_array_and_its_episode(
