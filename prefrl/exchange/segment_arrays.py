@@ -73,8 +73,9 @@ def each(archive: Arrays) -> Iterator[tuple[str, Callable[[], Segment]]]:
         arrays["actions"] = _one_hot(arrays["actions"], archive)
     lengths, row = arrays.pop("lengths", None), "row"
     if lengths is not None:
-        row, cuts = "episode", np.cumsum(lengths)[:-1]
-        split = {name: np.split(array, cuts) for name, array in arrays.items()}
+        row, ends = "episode", np.cumsum(lengths)
+        # After the last end there is one part more, with nothing in it; without it no lengths are no episode.
+        split = {name: np.split(array, ends)[:-1] for name, array in arrays.items()}
     else:
         split = {name: list(array) for name, array in arrays.items()}
     episodes, starts = _origins(archive, len(split["actions"]))
