@@ -1,6 +1,7 @@
 """Recorded behaviour that is imported: each segment a demonstration that stands for itself, all of them or none."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -174,11 +175,13 @@ def test_a_bad_episode_of_minari_is_named_and_nothing_is_written(store: Store[Se
         file["episode_1/observations"][0] = np.nan
     with pytest.raises(ValueError, match="set: nothing was read\nepisode 1: holds values that are not finite"):
         import_judgements(folder, store)
-    with h5py.File(folder / "main_data.hdf5", "a") as file:
-        del file["episode_1/observations"]
-        file["episode_1/observations"] = np.zeros((4, 5), np.float32)
-    with pytest.raises(ValueError, match=r"episode 1: has observations \(4, 5\) and actions \(3, 3\); expected"):
-        import_judgements(folder, store)
+    for shape in ((4, 5), (6, 2)):
+        with h5py.File(folder / "main_data.hdf5", "a") as file:
+            del file["episode_1/observations"]
+            file["episode_1/observations"] = np.zeros(shape, np.float32)
+        said = re.escape(f"episode 1: has observations {shape} and actions (3, 3); expected (T + 1, O) and (T, A)")
+        with pytest.raises(ValueError, match=said):
+            import_judgements(folder, store)
     (folder / "main_data.hdf5").write_bytes((folder / "main_data.hdf5").read_bytes()[:500])
     with pytest.raises(ValueError, match="episode 0: cannot be read: "):
         import_judgements(folder, store)
