@@ -20,6 +20,7 @@ from prefrl.fit.settings import FittingSettings, check_settings, check_shown
 from prefrl.kinds import named
 from prefrl.loop import Loop, LoopSettings
 from prefrl.protocols import (
+    ControlTask,
     Demonstrates,
     GoesByGold,
     Imagines,
@@ -310,13 +311,23 @@ def _at(source: str | Path, error: yaml.MarkedYAMLError) -> str:
 
 
 def _check_holds(store: Store, task: Task) -> None:
-    """Raises `ConfigError` where what was asked about or shown before is of another kind than the task's."""
+    """Raises `ConfigError` where what was asked about or shown before is of another kind than the task's, or where
+    what was shown step by step cannot be done in it."""
     ours = named(task.kind)
     if store.holds and store.holds != ours.noun:
         raise ConfigError(
             f"{store.folder} holds {store.holds}s, and {task.name} is learned from {ours.noun}s: choose "
             "another folder with --out, or the task that these are for"
         )
+    if not ours.stepwise:
+        return
+    from prefrl.exchange.recordings import called, check_imitable  # with the database, which settings alone do not need
+
+    for one in store.demonstrations():
+        try:
+            check_imitable(one.like, cast(ControlTask, task), f"{called(one.like)}, by {one.demonstration.labeler!r},")
+        except ValueError as error:
+            raise ConfigError(f"{store.folder}: {error}") from error
 
 
 def _shows(labeler: Labeler) -> bool:

@@ -10,6 +10,7 @@ from prefrl import Config, Run
 from prefrl.components import ConfigError
 from prefrl.config import _check_holds
 from prefrl.envs.text import Reviews
+from prefrl.exchange.ports import import_judgements
 from prefrl.improve.dpo import DPOSettings
 from prefrl.improve.sft import SFTSettings
 from prefrl.judgements import Comparison, Demonstration
@@ -75,6 +76,29 @@ def test_a_demonstrator_without_anything_shown_is_refused(tmp_path: Path) -> Non
     shown(tmp_path / "store", Segment(np.zeros((90, 3), np.float32), np.zeros((90, 1), np.float32), "ann/0", 0))
     with Run(config, tmp_path / "store") as run:
         assert run.loop.round == -1
+
+
+@pytest.mark.parametrize(
+    ("observations", "action", "says"),
+    [
+        (2, 9.0, r"has the action \[9\. 0\.\] in step 2, outside of the bounds"),
+        (5, 0.0, r"has observations and actions of \(5, 2\) numbers a step, but .* has \(2, 2\)"),
+    ],
+)
+def test_imported_behaviour_that_does_not_fit_the_task_is_named_before_anything_is_asked(
+    tmp_path: Path, observations: int, action: float, says: str
+) -> None:
+    seen, done = np.zeros((6, observations), np.float32), np.zeros((6, 2), np.float32)
+    done[5, 0] = action
+    np.savez(tmp_path / "x.npz", observations=seen, actions=done, lengths=[3, 3])
+    with Store[Segment](tmp_path / "run") as store:
+        import_judgements(tmp_path / "x.npz", store)
+    bad = 2 if action else 1
+    with pytest.raises(
+        ConfigError, match=f"run: the demonstration 'episode {bad}/.*' from step 0, by 'file:.*', {says}"
+    ):
+        Run(Config.load("control/toy", ["loop.labels=8"]), tmp_path / "run")
+    assert not (tmp_path / "run/config.yaml").exists()
 
 
 def test_fine_tuning_needs_something_shown_or_judged_and_dpo_does_not_say_so(toy_reviews: Reviews) -> None:

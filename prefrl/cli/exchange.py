@@ -79,7 +79,12 @@ def export_(
     store: Annotated[
         Path, typer.Argument(help="A folder of `prefrl run`, `label` or `fit`; for onnx also a zip.", exists=True)
     ],
-    to: Annotated[Path, typer.Option(help="A folder for dataset, minari, bundle and models, else a file.")],
+    to: Annotated[
+        Path,
+        typer.Option(
+            help="A folder for dataset, minari, bundle and models, else a file; .npz for what was shown in control."
+        ),
+    ],
     form: Annotated[
         Form, typer.Option(help="The columns of TRL, what other tools read, all there is, or a model.")
     ] = Form.preferences,
@@ -91,7 +96,7 @@ def export_(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Write over a file that is there.")] = False,
 ) -> None:
-    """Write judgements, a reward model of text or a policy to files, and say what these could not hold."""
+    """Write answers, a reward model of text or a policy to files, and say what these could not hold."""
     from prefrl.cli.console import say
 
     if best and form not in (Form.sb3, Form.onnx):
@@ -143,7 +148,10 @@ def _export_model(source: Path, to: Path, form: Form, best: bool) -> str:
 
 @commands.command("import")
 def import_(
-    path: Annotated[Path, typer.Argument(help="A file of judgements, a data set's folder, or a bundle.", exists=True)],
+    path: Annotated[
+        Path,
+        typer.Argument(help="A file of judgements or demonstrations, a data set's folder, or a bundle.", exists=True),
+    ],
     labelers: Labelers = "",
     split: Split = "",
     out: Out = Path("labels"),
@@ -154,7 +162,7 @@ def import_(
     skip_bad: Annotated[bool, typer.Option("--skip-bad", help="Leave bad rows out, and name them.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check everything, write nothing.")] = False,
 ) -> None:
-    """Read judgements and demonstrations from files into a store, all or none."""
+    """Read judgements and demonstrations from files into a store, all or none; recorded behaviour is demonstrations."""
     from prefrl.cli.console import say
     from prefrl.exchange.layout import Layout, Which
 

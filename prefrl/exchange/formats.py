@@ -1,4 +1,4 @@
-"""Files of judgements, read whole or not at all: judged responses to prompts, and judged pairs of segments.
+"""Files of answers, read whole or not at all: judged responses to prompts, judged pairs of segments, demonstrations.
 
 What goes into a store is read twice: once to find every mistake, and once for its judgements, so that none of it need
 be kept. What is wanted in memory is read once, and kept.
@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from prefrl.exchange.behaviour import behaviour_rows, is_behaviour
 from prefrl.exchange.layout import Layout, Parts, Row, Which
 from prefrl.exchange.reading import TABLES, list_files
 from prefrl.judgements import Judged, person
@@ -90,6 +91,9 @@ def check_file(path: Path, which: Which | None = None, layout: Layout | None = N
     # Only a file that leaves a labeler out is hashed: that goes through all of it once more.
     default = f"file:{_digest(path)}" if found.nameless else ""
     found.name(default)
+    if is_behaviour(path):
+        count = sum(found.counts.values())
+        notes = (f"recorded behaviour, read as demonstrations: {count} by {default}", *notes)
     labelers = {person(who) for who, _ in found.counts}
     if not which.labelers and {HUMAN, SCRIPT} <= labelers:
         which = replace(which, labelers=tuple(labelers - {SCRIPT}))
@@ -162,11 +166,13 @@ class _Found:
             notes += (f"{self.repeated} x {again}: {shown}",)
         if not self.counts:
             reasons = "".join(f"; {note}" for note in notes)
-            raise ValueError(f"{path}: expected at least one row with a judgement, got none{reasons}")
+            raise ValueError(f"{path}: expected at least one judgement or demonstration, got none{reasons}")
         return notes
 
 
 def _parts(path: Path, layout: Layout) -> Parts:
+    if is_behaviour(path):
+        return behaviour_rows(path, layout)
     if path.suffix == ".npz":
         from prefrl.exchange.segment_pairs import segment_pairs
 
@@ -183,7 +189,7 @@ def _parts(path: Path, layout: Layout) -> Parts:
 
 def _digest(path: Path) -> str:
     if path.is_dir():
-        files = list_files(path, [f"*{suffix}*" for suffix in (*TABLES, ".json")])
+        files = list_files(path, [f"*{suffix}*" for suffix in (*TABLES, ".json", ".hdf5")])
         return hashlib.sha256("".join(_digest(file) for file in files).encode()).hexdigest()[:12]
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:12]

@@ -1,9 +1,11 @@
-"""Judged segments from a Minari data set with `labels.jsonl` beside it, as `exports.minari` writes them."""
+"""Minari data sets: judged segments where `labels.jsonl` lies beside them, as `exports.minari` writes them, and the
+episodes of any other."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,17 +18,22 @@ from prefrl.exchange.reading import parse_json, read_lines, refuse_links
 from prefrl.types import Fields, Floats, Segment
 
 LABELS = "labels.jsonl"
+METADATA = "metadata.json"
 
 
 def is_minari(folder: Path) -> bool:
     """Whether a folder is a Minari data set with labels."""
-    return (folder / "metadata.json").exists() and (folder / LABELS).exists()
+    return (folder / METADATA).exists() and (folder / LABELS).exists()
+
+
+def is_unjudged(folder: Path) -> bool:
+    """Whether a folder is a Minari data set without labels: other data sets may have a metadata.json as well."""
+    return (folder / METADATA).exists() and not (folder / LABELS).exists() and "data_format" in _metadata(folder)
 
 
 def minari_rows(folder: Path) -> Parts:
     """(row N, what reads it) for each label. Raises `ValueError` where the data set is not one of ours."""
-    refuse_links(folder)
-    episodes = _Episodes(_storage(folder))
+    episodes = _Episodes(_opened(folder))
     for number, line in enumerate(read_lines(folder / LABELS), 1):
         yield f"{LABELS}, row {number}", partial(_parse, line, episodes)
 
@@ -38,28 +45,65 @@ def episodes(folder: Path) -> tuple[list[Segment], tuple[Floats, Floats] | None]
 
     The gold is attached where rewards are the task's own: in data sets that were not exported from a store.
     """
-    refuse_links(folder)
-    storage = _storage(folder)
-    found = []
+    storage, found = _opened(folder), []
     for number in range(storage.total_episodes):
-        (data,), (meta,) = storage.get_episodes([number]), storage.get_episode_metadata([number])
-        options = meta.get("options") or {}
-        if "candidate" in options:
-            found.append(_segment(data, options, storage.action_space))
-        else:
-            one = _segment(data, {"episode": f"episode {number}"}, storage.action_space)
-            found.append(replace(one, gold=np.asarray(data["rewards"], np.float64)))
+        with _called(number):
+            one = _episode(storage, number)
+        found.append(one if one.episode else replace(one, episode=f"episode {number}"))
     space = storage.action_space
     return found, None if _discrete(space) else (space.low.astype(np.float32), space.high.astype(np.float32))
 
 
+def each(folder: Path) -> Iterator[tuple[str, Callable[[], Segment]]]:
+    """(place, what reads it) for every episode; it is named "" where it was not exported from a store."""
+    storage = _opened(folder)
+    for number in range(storage.total_episodes):
+        yield f"episode {number}", partial(_episode, storage, number)
+
+
+def _episode(storage: Any, number: int) -> Segment:
+    """An episode, named as in the store that it was exported from, else "", with its rewards as the gold."""
+    data, options = _read(storage, number)
+    if "candidate" in options:
+        return _segment(data, options, storage)
+    one = _segment(data, {"episode": ""}, storage)
+    return replace(one, gold=np.asarray(data["rewards"], np.float64))
+
+
+def _read(storage: Any, number: int) -> tuple[Fields, Fields]:
+    """The arrays of an episode, and its options. Raises `ValueError` where they are not whole."""
+    try:
+        (data,), (meta,) = storage.get_episodes([number]), storage.get_episode_metadata([number])
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"cannot be read: {error}") from error
+    return data, meta.get("options") or {}
+
+
+@contextmanager
+def _called(number: int) -> Iterator[None]:
+    """What is wrong with an episode is told by its number."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"episode {number} {error}") from None
+
+
+def _opened(folder: Path) -> Any:
+    refuse_links(folder)
+    return _storage(folder)
+
+
+def _metadata(folder: Path) -> Fields:
+    try:
+        found = json.loads((folder / METADATA).read_text())
+    except ValueError as error:
+        raise ValueError(f"{folder / METADATA} is no JSON: {error}") from None
+    return found if isinstance(found, dict) else {}
+
+
 def _storage(folder: Path) -> Any:
     """The data set's storage. Its own spaces must be in it: without them Minari would make the environment it names."""
-    try:
-        metadata = json.loads((folder / "metadata.json").read_text())
-    except ValueError as error:
-        raise ValueError(f"{folder / 'metadata.json'} is no JSON: {error}") from None
-    known = metadata if isinstance(metadata, dict) else {}
+    known = _metadata(folder)
     spaces = [known.get(name) for name in ("observation_space", "action_space")]
     read = [json.loads(space) for space in spaces if isinstance(space, str)]
     if [isinstance(space, dict) and space.get("type") for space in read] not in (["Box", "Box"], ["Box", "Discrete"]):
@@ -98,27 +142,33 @@ class _Episodes:
         if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < total:
             raise ValueError(f"expected the number of an episode, from 0 to {total - 1}, got {number!r:.200}")
         if number not in self.found:
-            (data,) = self.storage.get_episodes([number])
-            (meta,) = self.storage.get_episode_metadata([number])
-            self.found[number] = _segment(data, meta.get("options") or {}, self.storage.action_space)
+            with _called(number):
+                data, options = _read(self.storage, number)
+                self.found[number] = _segment(data, options, self.storage)
         return self.found[number]
 
 
-def _segment(data: Fields, options: Fields, space: Any) -> Segment:
-    observations = np.asarray(data["observations"], np.float32)
-    actions = _one_hot(data, space) if _discrete(space) else np.asarray(data["actions"], np.float32)
+def _segment(data: Fields, options: Fields, storage: Any) -> Segment:
+    """Raises `ValueError` for what cannot be one, as the end of a sentence about the episode."""
+    observations, space = np.asarray(data["observations"], np.float32), storage.action_space
+    actions = _one_hot(data["actions"], space) if _discrete(space) else np.asarray(data["actions"], np.float32)
+    seen, done = storage.observation_space.shape, (int(space.n),) if _discrete(space) else space.shape
+    steps = len(actions)
+    if (observations.shape, actions.shape) != ((steps + 1, *seen), (steps, *done)) or len(seen) != 1 or len(done) != 1:
+        raise ValueError(
+            f"has observations {observations.shape} and actions {actions.shape}; expected (T + 1, O) and (T, A), as "
+            f"its data set says: {seen} and {done} a step"
+        )
     if not np.isfinite(observations).all() or not np.isfinite(actions).all():
-        raise ValueError(f"episode {data['id']} holds values that are not finite")
+        raise ValueError("holds values that are not finite")
     return Segment(observations[:-1], actions, str(options.get("episode")), int(options.get("start", 0)))
 
 
-def _one_hot(data: Fields, space: Any) -> Floats:
+def _one_hot(taken: Any, space: Any) -> Floats:
     """(T,) discrete actions, which count from the space's start, -> (T, A)."""
-    actions, start, count = np.asarray(data["actions"]), int(space.start), int(space.n)
+    actions, start, count = np.asarray(taken), int(space.start), int(space.n)
     if actions.ndim != 1 or not np.isin(actions, np.arange(start, start + count)).all():
-        raise ValueError(
-            f"episode {data['id']} has actions that are not whole numbers from {start} to {start + count - 1}"
-        )
+        raise ValueError(f"has actions that are not whole numbers from {start} to {start + count - 1}")
     found: Floats = (actions[:, None] == np.arange(start, start + count)).astype(np.float32)
     return found
 

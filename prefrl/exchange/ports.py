@@ -9,6 +9,7 @@ from pathlib import Path
 import sqlalchemy as sql
 
 from prefrl.exchange.bundles import export_bundle, import_bundle, is_bundle, try_bundle
+from prefrl.exchange.exports.behaviour import export_behaviour
 from prefrl.exchange.exports.dataset import export_dataset
 from prefrl.exchange.exports.given import Exported
 from prefrl.exchange.exports.minari import export_minari
@@ -25,6 +26,7 @@ from prefrl.exchange.formats import check_file
 from prefrl.exchange.layout import Layout, Row, Which
 from prefrl.exchange.recognition import recognised
 from prefrl.judgements import Answer
+from prefrl.kinds import logged
 from prefrl.storage.arrivals import Against, otherwise
 from prefrl.storage.events import describe, read_answer, write_candidate
 from prefrl.storage.log import StoreError, Transaction, row
@@ -52,7 +54,7 @@ EXPORTS: Mapping[str, Callable[[Store, Path, str], Exported]] = {
     "conversational": lambda store, path, ties: export_preferences(store, path, ties, conversational=True),
     "unpaired": lambda store, path, _: export_unpaired(store, path),
     "unpaired-conversational": lambda store, path, _: export_unpaired(store, path, conversational=True),
-    "demonstrations": lambda store, path, _: export_demonstrations(store, path),
+    "demonstrations": lambda store, path, _: _export_shown(store, path),
     "judgements": lambda store, path, _: export_judgements(store, path),
     "dataset": lambda store, path, _: export_dataset(store, path),
     "argilla": lambda store, path, _: export_argilla(store, path),
@@ -73,11 +75,17 @@ def export(store: Store, path: Path, form: str = "preferences", ties: str = "dro
     return EXPORTS[form](store, path, ties)
 
 
+def _export_shown(store: Store, path: Path) -> Exported:
+    """Behaviour that goes step by step is arrays, and any other is rows."""
+    steps = bool(store.holds) and logged(store.holds).stepwise
+    return export_behaviour(store, path) if steps else export_demonstrations(store, path)
+
+
 # --- in -----------------------------------------------------------------------------------------------------------
 
 
 def import_judgements(path: Path, store: Store, which: Which | None = None, layout: Layout | None = None) -> Imported:
-    """Read a file of judgements (`read_judgements` says which), or a bundle, into a store, all or none.
+    """Read a file of answers (`read_judgements` says which), or a bundle, into a store, all or none.
 
     A second reading changes nothing. Raises `ValueError` for what is wrong in the file, and `StoreError` where the
     store holds another judgement of the same query by a labeler of the same name.

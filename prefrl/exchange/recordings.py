@@ -41,7 +41,7 @@ def recording(path: Path) -> Recording:
         raise ValueError(f"{path}: expected observations and actions of one size each, got {got}")
     ((_, size),) = sizes
     free = (np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32))
-    discrete = size > 1 and all(_one_hot(one.actions) for one in found.values())
+    discrete = size > 1 and all(is_one_hot(one.actions) for one in found.values())
     return Recording(tuple(found.values()), None if discrete else bounds or free, tuple(found))
 
 
@@ -84,7 +84,7 @@ def check_imitable(one: Segment, task: ControlTask, name: str = "") -> None:
     """Raise `ValueError` where a behaviour, which is called by its name, cannot be imitated in a task."""
     kind, bounds = kind_of(one), task.action_bounds
     fault = kind.misfit(one, task) or kind.fault(one) or ("has no step" if not len(one) else "")
-    if not fault and bounds is None and not _one_hot(one.actions):
+    if not fault and bounds is None and not is_one_hot(one.actions):
         fault = "has actions that are not one-hot, and those of the task are discrete"
     if not fault and bounds is not None:
         low, high = (np.asarray(side) for side in bounds)
@@ -104,5 +104,6 @@ def _demonstrated(folder: Path) -> list[Segment]:
     return only(Segment, shown, ValueError(f"{folder} holds demonstrations of text: expected those of control"))
 
 
-def _one_hot(actions: Floats) -> bool:
+def is_one_hot(actions: Floats) -> bool:
+    """Whether each step (T, A) has a single 1, and else 0."""
     return bool(np.isin(actions, (0.0, 1.0)).all() and (actions.sum(1) == 1).all())

@@ -3,6 +3,7 @@
 Either `observations` (N, T, O), `actions` (N, T, A) and, where the gold is known, `rewards` (N, T); or, for episodes of
 unlike length, (S, O), (S, A) and (S,) with `lengths` (N,), which sum to S. Discrete actions are one-hot, or whole
 numbers from 0 on, (N, T) or (S,); `action_count` says how many there are where the highest one was never taken.
+`episodes` (N,), text, may say of which episode each is, and `starts` (N,) from which of its steps on.
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ from __future__ import annotations
 import hashlib
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
-from prefrl.types import Floats, Segment
+from prefrl.types import LARGEST, Floats, Segment
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 LARGEST_COUNT = 10_000
@@ -27,22 +30,40 @@ UNLIKE = (
     "(N,) how many each episode has"
 )
 
+_DAMAGED = (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What reading an archive raises where it is not whole, or is packed in a way that cannot be read."""
+
 
 @contextmanager
 def archived(path: Path) -> Iterator[Arrays]:
     """The arrays of a file, whose name stands in front of what is wrong with them."""
-    try:
-        with path.open("rb") as file:
+    with path.open("rb") as file:
+        try:
             archive = np.load(file, allow_pickle=False)  # a pickle can run any code
             if not isinstance(archive, Mapping):
                 raise ValueError("expected an archive of arrays, got one array")
             yield archive
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: {error}") from error
+        except _DAMAGED as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 def rows(archive: Arrays) -> dict[str, Segment]:
     """Every segment, by what its place in the arrays is called. Raises `ValueError` where they do not fit."""
+    found = {}
+    for place, make in each(archive):
+        try:
+            one = make()
+        except ValueError as error:
+            raise ValueError(f"{place}: {error}") from None
+        found[place] = one if one.episode else named("segment", one)
+    return found
+
+
+def each(archive: Arrays) -> Iterator[tuple[str, Callable[[], Segment]]]:
+    """(place, what makes it) for every segment; its episode is "" where the file names none.
+
+    Raises `ValueError` where the arrays do not fit; what makes a segment does where values are not finite.
+    """
     if "actions" not in archive:
         raise ValueError("array actions is missing")
     names = [name for name in ("observations", "actions", "rewards", "lengths") if name in archive]
@@ -52,20 +73,37 @@ def rows(archive: Arrays) -> dict[str, Segment]:
         arrays["actions"] = _one_hot(arrays["actions"], archive)
     lengths, row = arrays.pop("lengths", None), "row"
     if lengths is not None:
-        row, cuts = "episode", np.cumsum(lengths)[:-1]
-        split = {name: np.split(array, cuts) for name, array in arrays.items()}
+        row, ends = "episode", np.cumsum(lengths)
+        # After the last end there is one part more, with nothing in it; without it no lengths are no episode.
+        split = {name: np.split(array, ends)[:-1] for name, array in arrays.items()}
     else:
         split = {name: list(array) for name, array in arrays.items()}
-    found = {}
-    for i, (observations, actions) in enumerate(zip(split["observations"], split["actions"], strict=True)):
-        place = f"{row} {i + 1}"
-        gold = split["rewards"][i].astype(np.float64) if "rewards" in split else None
-        seen, done = (
-            finite(f"{name}, {place}", values)
-            for name, values in (("observations", observations), ("actions", actions))
-        )
-        found[place] = named("segment", seen, done, gold)
-    return found
+    episodes, starts = _origins(archive, len(split["actions"]))
+    for i in range(len(split["actions"])):
+        yield f"{row} {i + 1}", partial(_segment, {name: split[name][i] for name in arrays}, episodes[i], starts[i])
+
+
+def _segment(arrays: Arrays, episode: str, start: int) -> Segment:
+    observations, actions = (finite(f"array {name}", arrays[name]) for name in ("observations", "actions"))
+    gold = arrays["rewards"].astype(np.float64) if "rewards" in arrays else None
+    return Segment(observations, actions, episode, start, gold=gold)
+
+
+def _origins(archive: Arrays, count: int) -> tuple[list[str], list[int]]:
+    """Of which episode each segment is, "" where nothing is said, and from which step on."""
+    if "episodes" not in archive:
+        if "starts" in archive:
+            raise ValueError("array starts says from which step of its episode each segment is: add episodes (N,)")
+        return [""] * count, [0] * count
+    episodes = _read(archive, "episodes")
+    starts = _read(archive, "starts") if "starts" in archive else np.zeros(count, int)
+    if episodes.shape != (count,) or episodes.dtype.kind != "U" or not all(episodes):
+        got = f"{episodes.dtype} of shape {episodes.shape}"
+        raise ValueError(f"array episodes: expected a text for each of {count} segments, got {got}")
+    if starts.shape != (count,) or starts.dtype.kind not in "iu" or ((starts < 0) | (starts > LARGEST)).any():
+        got = f"{starts.dtype} of shape {starts.shape}"
+        raise ValueError(f"array starts: expected a step from 0 on for each of {count} segments, got {got}")
+    return [str(name) for name in episodes], [int(start) for start in starts]
 
 
 def finite(name: str, values: np.ndarray) -> Floats:
@@ -78,10 +116,10 @@ def finite(name: str, values: np.ndarray) -> Floats:
     return found
 
 
-def named(part: str, observations: Floats, actions: Floats, gold: Floats | None = None) -> Segment:
+def named(part: str, one: Segment) -> Segment:
     """A segment that is called after its part and its content: the same one in two pairs is one candidate."""
-    content = hashlib.sha256(observations.tobytes() + actions.tobytes()).hexdigest()[:16]
-    return Segment(observations, actions, episode=f"{part}/{content}", start=0, gold=gold)
+    content = hashlib.sha256(one.observations.tobytes() + one.actions.tobytes()).hexdigest()[:16]
+    return replace(one, episode=f"{part}/{content}")
 
 
 def _read(archive: Arrays, name: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from prefrl.exchange.layout import Parts, Row
-from prefrl.exchange.segment_arrays import archived, finite, named, rows
+from prefrl.exchange.segment_arrays import Arrays, archived, finite, named, rows
 from prefrl.judgements import Comparison
 from prefrl.types import Fields, Query, Segment
 
@@ -25,11 +25,19 @@ def segment_pairs(path: Path) -> Parts:
     with archived(path) as archive:
         splits = _splits(archive)
         if not splits:
-            raise ValueError(f"expected arrays named train_obs_1 and so on, got {', '.join(archive) or 'none'}")
+            raise ValueError(_nothing(archive))
         for split in splits:
             arrays, labels = _arrays(archive, split)
             for i in range(len(arrays["obs_1"])):
                 yield f"{split}, row {i + 1}", partial(_rows, arrays, labels, split, i)
+
+
+def judges(path: Path) -> bool:
+    """Whether a file is of pairs, and not of segments that nobody judged. Raises `ValueError` for what is neither."""
+    with archived(path) as archive:
+        if not (_splits(archive) or "observations" in archive):
+            raise ValueError(_nothing(archive))
+        return bool(_splits(archive))
 
 
 def segments(path: Path) -> dict[str, Segment]:
@@ -41,8 +49,7 @@ def segments(path: Path) -> dict[str, Segment]:
         if "observations" in archive:
             return rows(archive)
         if not (splits := _splits(archive)):
-            known = ", ".join(archive) or "none"
-            raise ValueError(f"expected arrays named train_obs_1 and so on, or observations and actions, got {known}")
+            raise ValueError(_nothing(archive))
         found: dict[str, tuple[str, Segment]] = {}
         for split in splits:
             arrays, _ = _arrays(archive, split)
@@ -53,8 +60,13 @@ def segments(path: Path) -> dict[str, Segment]:
         return dict(found.values())
 
 
-def _splits(archive: Mapping[str, np.ndarray]) -> list[str]:
+def _splits(archive: Arrays) -> list[str]:
     return [name.removesuffix("_obs_1") for name in archive if name.endswith("_obs_1")]
+
+
+def _nothing(archive: Arrays) -> str:
+    known = ", ".join(archive) or "none"
+    return f"expected arrays named train_obs_1 and so on, or observations and actions, got {known}"
 
 
 def _arrays(file: Fields, split: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -97,4 +109,4 @@ def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], sp
 
 def _segment(arrays: Mapping[str, np.ndarray], split: str, side: str, i: int) -> Segment:
     seen, done = (finite(f"{name}_{side}", arrays[f"{name}_{side}"][i]) for name in ("obs", "action"))
-    return named(split, seen, done)
+    return named(split, Segment(seen, done, "", 0))

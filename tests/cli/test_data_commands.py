@@ -3,6 +3,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from run_folders import folder_of_run
 
@@ -93,6 +94,31 @@ def test_an_import_says_what_was_there_already(prefrl: Command) -> None:
         in (prefrl("import in.jsonl --out labels --dry-run")[1])
     )
     assert "2 answers read into labels: 1 new, 1 there already" in prefrl("import in.jsonl --out labels")[1]
+
+
+def test_recorded_behaviour_comes_in_is_cloned_and_goes_out(prefrl: Command) -> None:
+    rng = np.random.default_rng(0)
+    seen, done = rng.normal(size=(5, 3)).astype(np.float32), rng.uniform(-2, 2, (5, 1)).astype(np.float32)
+    np.savez("episodes.npz", observations=seen, actions=done, lengths=[2, 3])
+    code, printed = prefrl("import episodes.npz --out run --dry-run")
+    assert (code, "2 answers would be read" in printed, Path("run").exists()) == (0, True, False)
+    assert "recorded behaviour, read as demonstrations: 2 by file:" in prefrl("import episodes.npz --out run")[1]
+    assert "2 answers read into run: 0 new, 2 there already" in prefrl("import episodes.npz --out run")[1]
+    code, printed = prefrl("export run --form demonstrations --to out.csv")
+    assert (code, "go into an .npz" in printed) == (2, True)
+    code, printed = prefrl("export run --form demonstrations --to out.npz")
+    assert (code, "2 written to out.npz" in printed) == (0, True)
+    with np.load("out.npz") as file:
+        assert (file["observations"].tobytes(), file["actions"].tobytes()) == (seen.tobytes(), done.tobytes())
+    small = "learner.cloning_epochs=1 learner.evaluation_episodes=1"
+    code, printed = prefrl(f"run control/pendulum-demos labeler.episodes=0 {small} --out run")
+    assert (code, "demonstrations 2" in printed) == (0, True)
+
+
+def test_recorded_behaviour_that_is_wrong_leaves_no_store_behind(prefrl: Command) -> None:
+    np.savez("bad.npz", observations=np.full((5, 3), np.nan), actions=np.zeros((5, 1)), lengths=[2, 3])
+    code, printed = prefrl("import bad.npz --out run")
+    assert (code, "episode 1: array observations is nan in step 0" in printed, Path("run").exists()) == (2, True, False)
 
 
 def test_an_export_never_writes_over_a_file_unasked(prefrl: Command) -> None:

@@ -105,7 +105,7 @@ def test_an_oracle_answers_about_segments_whose_gold_is_in_the_file(tmp_path: Pa
         ({"observations": np.zeros((3, 6), np.float32)}, r"expected observations \(N, T, O\)"),
         ({"rewards": np.zeros((24, 5))}, r"expected observations \(N, T, O\)"),
         ({"observations": np.zeros((24, 6, 3), np.int64)}, "expected floats"),
-        ({"observations": np.full((24, 6, 3), np.nan, np.float32)}, "observations, row 1 is nan in step 0"),
+        ({"observations": np.full((24, 6, 3), np.nan, np.float32)}, "row 1: array observations is nan in step 0"),
     ],
 )
 def test_a_bad_file_is_refused_with_what_is_wrong_with_it(tmp_path: Path, arrays: Any, message: str) -> None:

@@ -88,7 +88,7 @@ def test_many_bad_rows_are_cut_at_twenty_and_an_empty_file_is_an_error(
     with pytest.raises(ValueError, match="and 30 more"):
         import_judgements(path, text_store)
     path.write_text("")
-    with pytest.raises(ValueError, match="at least one row"):
+    with pytest.raises(ValueError, match="at least one judgement"):
         import_judgements(path, text_store)
 
 

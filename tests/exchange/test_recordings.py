@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from recorded_files import JOINED, SEEN, TAKEN, minari_folder, saved
 
 from prefrl.envs.control import ControlSettings
 from prefrl.exchange.ports import export
@@ -15,16 +16,6 @@ from prefrl.judgements import Demonstration
 from prefrl.protocols import ControlTask
 from prefrl.store import Store
 from prefrl.types import Query, Segment
-
-SEEN = np.arange(10, dtype=np.float32).reshape(5, 2)
-"""Five steps of two episodes, of 2 and of 3."""
-TAKEN = np.array([0, 2, 1, 1, 0])
-JOINED: dict[str, Any] = {"observations": SEEN, "actions": TAKEN, "lengths": np.array([2, 3]), "rewards": SEEN[:, 0]}
-
-
-def saved(path: Path, **arrays: Any) -> Path:
-    np.savez(path, **arrays)
-    return path
 
 
 def test_episodes_of_unlike_length_lie_one_after_another_and_whole_numbers_are_discrete_actions(tmp_path: Path) -> None:
@@ -63,8 +54,11 @@ def test_of_equal_lengths_whole_numbers_are_discrete_as_well_and_more_than_were_
         ({"action_count": 2}, "actions: expected whole numbers from 0 to 1, got 0 to 2"),
         ({"action_count": np.array([3])}, r"action_count: expected one whole number, got int64 of shape \(1,\)"),
         ({"actions": TAKEN + 10**8}, "actions: expected whole numbers from 0 to 9999"),
-        ({"observations": np.where(SEEN == 6, np.nan, SEEN)}, r"x\.npz: observations, episode 2 is nan in step 1"),
-        ({"actions": np.full((5, 1), np.inf)}, "actions, episode 1 is inf in step 0"),
+        (
+            {"observations": np.where(SEEN == 6, np.nan, SEEN)},
+            r"x\.npz: episode 2: array observations is nan in",
+        ),
+        ({"actions": np.full((5, 1), np.inf)}, "episode 1: array actions is inf in step 0"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_its_array_and_its_episode(
@@ -99,29 +93,6 @@ def test_a_bundle_is_to_be_imported_first(tmp_path: Path) -> None:
         export(store, tmp_path / "bundle", "bundle")
     with pytest.raises(ValueError, match=r"bundle is a bundle: import it first \(prefrl import"):
         recording(tmp_path / "bundle")
-
-
-def minari_folder(path: Path, start: int = 0, form: str = "arrow") -> Path:
-    """As Minari writes what an environment with discrete actions did: two episodes, of 2 steps and of 3."""
-    pytest.importorskip("minari")
-    from gymnasium.spaces import Box, Discrete
-    from minari.data_collector import EpisodeBuffer
-    from minari.dataset.minari_storage import MinariStorage
-
-    space = Box(-np.inf, np.inf, (2,), np.float32)
-    storage = MinariStorage.new(path.absolute(), space, Discrete(3, start=start), data_format=form)
-    for id, (first, last) in enumerate([(0, 2), (2, 5)]):
-        steps = last - first
-        episode = EpisodeBuffer(
-            id=id,
-            observations=np.concatenate([SEEN[first:last], SEEN[:1]]),
-            actions=TAKEN[first:last] + start,
-            rewards=[1.0] * steps,
-            terminations=[False] * (steps - 1) + [True],
-            truncations=[False] * steps,
-        )
-        storage.update_episodes([episode])
-    return path
 
 
 @pytest.mark.parametrize(("start", "form"), [(0, "arrow"), (4, "arrow"), (0, "hdf5")])

@@ -17,6 +17,7 @@ from prefrl import Config, Run, load_policy
 from prefrl.components import ConfigError
 from prefrl.envs.control import GymnasiumTask
 from prefrl.envs.toys import TMazeSettings, ToyTask
+from prefrl.exchange.ports import export, import_judgements
 from prefrl.exchange.recordings import recording
 from prefrl.improve.clone import CloneSettings
 from prefrl.improve.control import ControlLearnerSettings
@@ -264,6 +265,27 @@ def test_discrete_actions_that_are_not_one_hot_are_refused(tmp_path: Path) -> No
         store.answer([Demonstration(query.id, bad.id, "ann")])
         with pytest.raises(ValueError, match="not one-hot"):
             learner(point(discrete=True)).improve(cast(Any, Known()), store, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["x.npz", "set"])
+@pytest.mark.parametrize(("discrete", "advice"), [(False, to_the_middle), (True, push_to_the_middle)])
+def test_what_left_as_a_file_and_came_back_makes_the_same_clone(
+    tmp_path: Path, name: str, discrete: bool, advice: Advice
+) -> None:
+    if name == "set":
+        pytest.importorskip("minari")
+    task, found = point(discrete=discrete), list[State]()
+    own = cast("Store[Segment]", shown(tmp_path / "own", task, advice, episodes=2))
+    export(own, tmp_path / name, "demonstrations")
+    with Store[Segment](tmp_path / "again") as again, Store[Segment](tmp_path / "nothing") as nothing:
+        import_judgements(tmp_path / name, again)
+        for store, data in ((own, None), (again, None), (nothing, tmp_path / name)):
+            one = learner(task, cloning_epochs=2, data=data)
+            one.improve(cast(Any, Known()), cast(Any, store), np.random.default_rng(0))
+            found.append(one.policy.state())
+    for other in found[1:]:
+        for key, weights in found[0]["parameters"].items():
+            assert torch.equal(weights, other["parameters"][key])
 
 
 def test_what_is_asked_about_is_the_learners_own_behaviour_whatever_file_it_clones(tmp_path: Path) -> None:

@@ -47,13 +47,14 @@ def export_minari(store: Store, path: Path) -> Exported:
     with whole_folder(path) as work:
         storage: Any = None
         for segment in _segments(store):
-            storage = storage or _new(work, segment, path.name)
-            _add(storage, segment, episodes)
+            storage = storage or new_storage(work, segment, path.name)
+            add_episode(storage, segment, len(episodes))
+            episodes[segment.id] = len(episodes)
             tally.dropped[STATES] += segment.states is not None
         written = write_lines(work / LABELS, _labels(store, tally, episodes))
         if storage is None:
             raise StoreError(
-                f"{store.folder} holds no judgement of segments to write; demonstrations fit --form bundle"
+                f"{store.folder} holds no judgement of segments to write; demonstrations fit --form demonstrations"
             )
     return tally.done(store, written, f"{len(episodes)} segments as episodes", *NOTES)
 
@@ -69,7 +70,7 @@ def _segments(store: Store) -> Iterator[Segment]:
                 yield segment
 
 
-def _new(work: Path, segment: Segment, name: str) -> Any:
+def new_storage(work: Path, segment: Segment, name: str) -> Any:
     """An empty data set for segments of one size."""
     import minari
     from gymnasium.spaces import Box
@@ -83,7 +84,8 @@ def _new(work: Path, segment: Segment, name: str) -> Any:
     return storage
 
 
-def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
+def add_episode(storage: Any, segment: Segment, number: int) -> None:
+    """Write a segment as an episode that is cut off at its end. Raises `StoreError` for one of another size."""
     from minari.data_collector import EpisodeBuffer
 
     steps = len(segment)
@@ -92,7 +94,7 @@ def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
         raise StoreError(f"segments of sizes {sizes} and {found} do not fit one data set of Minari")
     last = segment.observations[-1:]
     episode = EpisodeBuffer(
-        id=len(episodes),
+        id=number,
         options={"candidate": segment.id, "episode": segment.episode, "start": segment.start},
         observations=np.concatenate([segment.observations, last]).astype(np.float32),
         actions=segment.actions.astype(np.float32),
@@ -101,7 +103,6 @@ def _add(storage: Any, segment: Segment, episodes: dict[str, int]) -> None:
         truncations=[False] * (steps - 1) + [True],
     )
     storage.update_episodes([episode])
-    episodes[segment.id] = len(episodes)
 
 
 def _labels(store: Store, tally: Tally, episodes: Mapping[str, int]) -> Iterator[Json]:

@@ -36,7 +36,7 @@ BOTH = "tie written both ways"
 MIDDLE = "response that is neither better than all others nor worse"
 ALONE = "rating of a single response"
 OPINION = "judgement or skip"
-ANSWERED = "response that a demonstration answers"
+ANSWERED = "behaviour that a demonstration answers"
 UNTOLD = "prompt that is no transcript, written as one message of a user"
 
 
@@ -152,14 +152,16 @@ def _unpaired(store: Store, tally: Tally, say: Conversations) -> Iterator[Json]:
 def export_demonstrations(store: Store, path: Path) -> Exported:
     """Write one JSON object a line with `prompt` and `completion`, and a `weight` other than 1: what was shown.
 
-    Raises `StoreError` for demonstrations of control.
+    Raises `ValueError` for a name that promises arrays, and `StoreError` for demonstrations of pictures.
     """
+    if path.suffix == ".npz":
+        raise ValueError(f"{path}: demonstrations of text are JSON lines: name the file .jsonl")
     opinions = 0
     for given in each_answer(store):
         refuse_segments(given, "demonstrations")
         opinions += 1
     shown = store.demonstrations()
-    error = StoreError("demonstrations of control segments do not fit JSON lines; use --form bundle")
+    error = StoreError(f"demonstrations of {store.holds}s do not fit JSON lines; use --form bundle")
     texts = only(Response, [one.like for one in shown], error)
     weights = [one.demonstration.weight for one in shown]
     rows = (
