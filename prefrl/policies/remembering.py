@@ -166,8 +166,8 @@ class RememberingPolicy:
         normalise, device, cut = self.normaliser.now(), self.device, list[list[Tensor]]()
         for one in segments:
             first = np.arange(len(one)) == 0
-            legal = [] if self._legal is None else [self._legal(one.observations)]
-            arrays = normalise(one.observations), self.space.choices(one.actions), first, np.ones_like(first), *legal
+            arrays = [normalise(one.observations), self.space.choices(one.actions), first, np.ones_like(first)]
+            arrays += [] if self._legal is None else [self._legal(one.observations)]
             cut.append([in_chunks(torch.from_numpy(x).to(device)[None], self.chunk) for x in arrays])
         seen, choices, begins, mask, *legal = (torch.cat(pieces) for pieces in zip(*cut, strict=True))
         known = self._networks.known(np.zeros((len(mask), self._networks.remembers), np.float32), normalise)

@@ -136,6 +136,6 @@ def test_demonstrations_are_read_in_pieces_as_the_policy_would_have_acted(kind: 
     # Weights that have moved remember otherwise.
     with torch.no_grad():
         for parameter in policy.parameters():
-            parameter += 0.1
+            parameter.data += 0.1
     again = policy.redrawn(examples, np.random.default_rng(0)).known
     assert (kind == "transformer") == torch.equal(again, drawn.known)  # which remembers observations
