@@ -49,7 +49,7 @@ def _parts() -> Iterator[tuple[str, tuple[str, Json]]]:
     for role, kind in every:
         whole = described(role, kind)
         for setting, one in whole["properties"].items():
-            for name, at in one.get("discriminator", {}).get("mapping", {}).items():
+            for name, at in _kinds(one).items():
                 group = {**whole["$defs"][_name({"$ref": at})], "$defs": whole["$defs"]}
                 yield name, (f"{role[:-1]}.{setting}.kind={name}, with {role[:-1]}.kind={kind}", group)
 
@@ -66,9 +66,9 @@ def setting_rows(described: Json, groups: Json, prefix: str = "") -> Iterator[tu
     for name, setting in described["properties"].items():
         if "$ref" in setting:
             yield from setting_rows(groups[_name(setting)], groups, f"{prefix}{name}.")
-        elif "oneOf" in setting:
-            of_kinds = {kind: groups[_name({"$ref": at})] for kind, at in setting["discriminator"]["mapping"].items()}
-            default = setting["default"]["kind"]
+        elif kinds := _kinds(setting):
+            of_kinds = {kind: groups[_name({"$ref": at})] for kind, at in kinds.items()}
+            default = setting["default"]["kind"] if setting["default"] else "null"
             yield f"{prefix}{name}.kind", " | ".join(of_kinds), default, setting.get("description", "")
             for kind, group in of_kinds.items():
                 own = {**group, "properties": {k: x for k, x in group["properties"].items() if k != "kind"}}
@@ -105,6 +105,12 @@ def _type(setting: Json, between: str = " ") -> str:
         return f"list of {_type(setting['items'])}"
     word = setting.get("format") or WORDS[setting["type"]]
     return between.join([word, *(f"{sign} {setting[bound]:g}" for bound, sign in SIGNS.items() if bound in setting)])
+
+
+def _kinds(setting: Json) -> dict[str, str]:
+    """Where the settings of each kind are, for a setting that has some kind of a few, or is null; else nothing."""
+    one = next((x for x in (setting, *setting.get("anyOf", [])) if "discriminator" in x), None)
+    return one["discriminator"]["mapping"] if one else {}
 
 
 def _name(reference: Json) -> str:
