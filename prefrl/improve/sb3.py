@@ -82,6 +82,8 @@ BATCH = 64
 """Steps that a trial run takes in all."""
 DISCOUNT = 0.99
 """The default `gamma` of its algorithms."""
+LARGEST = 1e10
+"""No weight that does anything is as large: what learning left there is numbers no more."""
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate")
 
 
@@ -309,11 +311,26 @@ class SB3:
         """What the algorithm learns in starts with fresh episodes, and is drawn from `rng`."""
         self._env.start(rng)
         self.model._last_obs = None  # makes learn() reset the environments
-        with seeded(rng):
-            self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
-            yield
+        try:
+            with seeded(rng):
+                self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own
+                yield
+        except ValueError as error:  # torch's, of a distribution that is none
+            self._check_weights(error)
+            raise
+        self._check_weights()
         if self._known.replays:
             cut(self.model.replay_buffer)
+
+    def _check_weights(self, cause: Exception | None = None) -> None:
+        """Raise FloatingPointError where what was learned is no policy any more."""
+        for name, weights in self.model.policy.named_parameters():
+            if not (weights.abs() < LARGEST).all():  # NaN is not below anything
+                algorithm, steps = type(self.model).__name__, self.model.num_timesteps
+                raise FloatingPointError(
+                    f"{algorithm}: after {steps} steps a weight of the policy ({name}) is not finite, or beyond "
+                    f"{LARGEST:g}: lower learner.options.learning_rate"
+                ) from cause
 
     def _taken(self, rng: np.random.Generator) -> Rollout:
         """What was done in it."""

@@ -106,6 +106,16 @@ def test_actions_that_an_algorithm_cannot_take_are_refused_with_those_that_can()
         _learner(point(discrete=True), _settings("TD3"))
 
 
+@pytest.mark.parametrize("name", ["PPO", "SAC", "DQN"])
+def test_weights_that_are_none_are_said_in_the_round_that_made_them(store: Store[Segment], name: Name) -> None:
+    settings = _settings(name)
+    settings["options"] = settings["options"] | {"learning_rate": 1e30}
+    learner = _learner(_task(name), settings, steps_per_round=400)
+    told = rf"{name}: after \d+ steps a weight of the policy .* is not finite, .*: lower learner\.options\.learning"
+    with pytest.raises(FloatingPointError, match=told):
+        learner.improve(Known(), store, np.random.default_rng(0))
+
+
 def _learner(task: GymnasiumTask, algorithm: dict[str, Any], seed: int = 0, **settings: object) -> SB3:
     small: dict[str, Any] = {"environments": 2, "steps_per_round": 80, "policy": NET, "evaluation_episodes": 3}
     return SB3Settings.model_validate({**small, **algorithm, **settings}).build(task, np.random.default_rng(seed))
