@@ -7,7 +7,8 @@
 in four rounds. Learners that write have 30 batches of 128 responses in each. The other measure is fluency.
 
 `imdb`: film reviews by SmolLM2, with VADER as the reward: the measures are that proxy and the gold. Every learner has
-24 batches in eight rounds, and writes as many responses for each.
+24 batches in eight rounds, writes as many responses for each, and moves adapters of rank 16 in all linear layers; but
+the preset as it is has adapters of rank 2 in the queries and values, and 36 batches in six rounds (`small adapter`).
 
 A point is an evaluation after a round, the mean over seeds. Best-of-n is by the reward of the first RLOO run, as in
 text_best_of_n.py. Finished runs are taken up. With `--learners` only those run, and what FILE.csv has of others and of
@@ -57,11 +58,13 @@ ON_RUBRIC: Runs = {
 }
 FILMS = ("loop.rounds=8", "learner.evaluation_prompts=96")
 LIKE_RLOO = ("learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", "learner.policy.train=lora")
+WIDE = (*FILMS, *LIKE_RLOO, "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear")
 ON_FILMS: Runs = {
-    "RLOO": ("text/imdb", FILMS),
-    "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),
-    "REINFORCE": ("text/imdb", (*FILMS, "learner.algorithm=reinforce")),
-    "PPO": ("text/imdb", (*FILMS, "learner.algorithm=ppo", "learner.epochs=2")),
+    "RLOO": ("text/imdb", WIDE),
+    "RLOO, small adapter": ("text/imdb", ("learner.evaluation_prompts=64",)),
+    "GRPO": ("text/imdb", (*WIDE, "learner.algorithm=grpo")),
+    "REINFORCE": ("text/imdb", (*WIDE, "learner.algorithm=reinforce")),
+    "PPO": ("text/imdb", (*WIDE, "learner.algorithm=ppo", "learner.epochs=2")),
     "online DPO": (
         "text/imdb",
         (*FILMS, "learner.kind=online_dpo", *LIKE_RLOO, "learner.prompts=24", "learner.soft=true"),
