@@ -176,15 +176,24 @@ def _parts(path: Path, layout: Layout) -> Parts:
     if path.suffix == ".npz":
         from prefrl.exchange.segment_pairs import segment_pairs
 
+        _check_default(path, layout)
         return segment_pairs(path)
     if path.is_dir():
         from prefrl.exchange.dataset_folders import folder_rows
         from prefrl.exchange.minari_folders import is_minari, minari_rows
 
-        return minari_rows(path) if is_minari(path) else folder_rows(path, layout)
+        if not is_minari(path):
+            return folder_rows(path, layout)
+        _check_default(path, layout)
+        return minari_rows(path)
     from prefrl.exchange.text_rows import text_rows
 
     return text_rows(path, layout)
+
+
+def _check_default(path: Path, layout: Layout) -> None:
+    if layout.columns or layout.form != "auto":
+        raise ValueError(f"{path} holds judged segments: --map and --form are for rows, leave them out")
 
 
 def _digest(path: Path) -> str:

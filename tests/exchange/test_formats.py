@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from prefrl.exchange.formats import read_judgements
-from prefrl.exchange.layout import Which
+from prefrl.exchange.formats import check_file, read_judgements
+from prefrl.exchange.layout import Layout, Which
 from prefrl.exchange.ports import import_judgements
 from prefrl.exchange.text_rows import parse
 from prefrl.judgements import Choice, Comparison, Judged, Ranking, Rating
@@ -240,6 +240,12 @@ def test_arrays_that_do_not_fit_are_named(pairs: Callable[..., Path], changes: d
     with pytest.raises(ValueError) as caught:
         read_judgements(pairs(**changes))
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("layout", [Layout(form="preferences"), Layout(columns=(("prompt", "question"),))])
+def test_what_is_said_of_rows_is_refused_for_pairs_of_segments(pairs: Callable[..., Path], layout: Layout) -> None:
+    with pytest.raises(ValueError, match=r"holds judged segments: --map and --form are for rows, leave them out"):
+        check_file(pairs(), layout=layout)
 
 
 def test_a_segment_compared_with_itself_is_refused_with_its_row(pairs: Callable[..., Path]) -> None:
