@@ -7,7 +7,8 @@ from functools import partial
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, cast, get_args, get_origin
 
 import numpy as np
 import yaml
@@ -414,6 +415,9 @@ def _explain(cls: type[Settings], error: ErrorDetails) -> str:
     if error["type"] == "union_tag_invalid":
         tags = [tag.strip(" '") for tag in error["ctx"]["expected_tags"].split(",")]
         return f"{path}.kind: unknown kind {error['ctx']['tag']!r}; {suggest(error['ctx']['tag'], tags)}"
+    if error["type"] == "union_tag_not_found":
+        kinds = [str(one.model_fields["kind"].default) for one in _groups(group.model_fields[names[-1]].annotation)]
+        return f"{path}.kind: missing; choose from: {', '.join(kinds)}"
     if error["type"] == "missing":
         about = group.model_fields[names[-1]].description if names[-1] in group.model_fields else None
         return f"{path}: missing; expected a value" + (f": {' '.join(about.split())}" if about else "")
@@ -434,10 +438,19 @@ def _place(cls: type[Settings], loc: Iterable[int | str]) -> tuple[list[str], ty
         field = cls.model_fields.get(names[-1])
         if not parts or field is None:
             continue
-        kinds = get_args(field.annotation) if field.discriminator else (field.annotation,)
-        groups = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Settings)]
-        if field.discriminator:
+        groups = _groups(field.annotation)
+        if len(groups) > 1:
             tag = parts.pop(0)
             groups = [group for group in groups if group.model_fields["kind"].default == tag]
         cls = groups[0] if groups else cls
     return names, cls
+
+
+def _groups(annotation: Any) -> list[type[Settings]]:
+    """The groups of settings that a setting may be: one, those of several kinds, or none where it is a plain value."""
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
+        return [annotation]
+    if get_origin(annotation) is Annotated:
+        return _groups(get_args(annotation)[0])
+    unions = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else ()
+    return [group for one in unions for group in _groups(one)]

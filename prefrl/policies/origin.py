@@ -106,7 +106,10 @@ def _of_run(folder: Path) -> _Found:
     network = said["learner"].get("policy") or {}  # null for the perceptron of a clone
     if ours and (network.get("kind", "mlp"), network.get("activation", "tanh")) != ("mlp", "tanh"):
         named = " with ".join(network[name] for name in ("kind", "activation") if network.get(name))
-        raise ConfigError(f"{folder} has a policy of kind {named}; expected kind mlp with tanh")
+        raise ConfigError(
+            f"{folder} has a policy of kind {named}; expected kind mlp with tanh: a flow, a gru or a transformer is "
+            "taken over where learner.policy is set as that run has it"
+        )
     if "mean" not in ours and "mlp_extractor.policy_net.0.weight" not in theirs:
         raise ConfigError(f"{folder} holds no policy of control that can be taken over; expected {OURS}")
     task = control(task_of(said), f"{folder}: expected a run of a control task")

@@ -374,6 +374,21 @@ def test_the_std_of_a_clone_with_a_memory_is_the_learners_and_is_learned_where_t
         assert 0 < metrics["cloning_loss"] < 1 / (2 * 0.3**2)
 
 
+@pytest.mark.parametrize(
+    ("policy", "told"),
+    [
+        ({"width": 8}, "learner.policy.kind: missing; choose from: flow, gru, transformer"),
+        ({"kind": "cnn"}, "learner.policy.kind: unknown kind 'cnn'; choose from: flow, gru, transformer"),
+        ({"kind": "gru", "wdth": 8}, "learner.policy.wdth: unknown setting; did you mean 'width'?"),
+        ({"kind": "gru", "width": 0}, "learner.policy.width: expected greater than or equal to 1, got 0"),
+    ],
+)
+def test_a_mistake_in_a_clones_policy_is_told_by_its_name(policy: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Config.load("control/pendulum-demos", [f"learner.policy={json.dumps(policy)}"])
+    assert str(caught.value) == told
+
+
 @pytest.mark.parametrize("change", [{"initial_std": 0.5}, {"sde": True}])
 def test_what_says_again_how_noisy_a_clone_is_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"std and learn_std say how noisy a clone is: leave policy\.initial_std"):
