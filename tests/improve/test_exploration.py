@@ -160,8 +160,8 @@ def test_a_zip_with_noise_of_another_kind_is_refused(tmp_path: Path) -> None:
             read_zip(tmp_path / f"{name}.zip")
 
 
-def test_a_policy_with_a_memory_or_other_units_is_no_start() -> None:
-    for settings in ({"kind": "gru"}, {"activation": "relu"}, {"critic_hidden": [8]}):
+def test_a_policy_of_pictures_or_other_units_is_no_start() -> None:
+    for settings in ({"kind": "cnn", "image": [36, 36, 3]}, {"activation": "relu"}, {"critic_hidden": [8]}):
         with pytest.raises(ValueError, match=r"leave learner\.policy as it is, but for hidden, initial_std, sde"):
             ControlLearnerSettings.model_validate({"start": "policy.zip", "policy": settings})
     ControlLearnerSettings.model_validate({"start": "policy.zip", "policy": {"hidden": [8], "initial_std": 0.5}})
