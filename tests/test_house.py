@@ -54,6 +54,12 @@ def test_nothing_that_computes_names_a_device() -> None:
     assert found == []
 
 
+def test_each_file_of_tests_has_a_name_of_its_own() -> None:
+    """Without packages pytest can import one of a name, and where both are collected the other is an error."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
+
+
 def test_few_files_lie_flat_at_the_root_of_the_package() -> None:
     assert len(list((ROOT / "prefrl").glob("*.py"))) <= 16
 
