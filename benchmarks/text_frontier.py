@@ -6,9 +6,9 @@
 `rubric`: the rubric of reviews, which fewer than one in a hundred of the start's responses meet, with 300 comparisons
 in four rounds. Learners that write have 30 batches of 128 responses in each. The other measure is fluency.
 
-`imdb`: film reviews by SmolLM2, with VADER as the reward: the measures are that proxy and the gold. Every learner has
-24 batches in eight rounds, writes as many responses for each, and moves adapters of rank 16 in all linear layers; but
-the preset as it is has adapters of rank 2 in the queries and values, and 36 batches in six rounds (`small adapter`).
+`imdb`: film reviews by SmolLM2, with VADER as the reward: the measures are that proxy and the gold. Learners are the
+preset with another algorithm: 36 batches of 48 responses in six rounds, and adapters of rank 2 in the queries and
+values. `wide` are adapters of rank 16 in all linear layers, 24 batches in eight rounds and a lower price of a nat.
 
 A point is an evaluation after a round, the mean over seeds. Best-of-n is by the reward of the first RLOO run, as in
 text_best_of_n.py. Finished runs are taken up. With `--learners` only those run, and what FILE.csv has of others and of
@@ -56,20 +56,23 @@ ON_RUBRIC: Runs = {
     "KTO": ("text/reviews-dpo", (*RUBRIC, "learner.kind=kto", "learner.epochs=4", "learner.evaluation_prompts=256")),
     "SFT": ("text/reviews-dpo", (*RUBRIC, "learner.kind=sft", "learner.epochs=4", "learner.evaluation_prompts=256")),
 }
-FILMS = ("loop.rounds=8", "learner.evaluation_prompts=96")
-LIKE_RLOO = ("learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", "learner.policy.train=lora")
-WIDE = (*FILMS, *LIKE_RLOO, "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear")
+FILMS = ("learner.evaluation_prompts=64",)
+SMALL = ("learner.updates=6", "learner.prompts=6", "learner.beta=0.05", "learner.learning_rate=1e-3")
+SMALL = (*SMALL, "learner.missing_end_penalty=0", "learner.policy.train=lora", "learner.policy.lora_rank=2")
+SMALL = (*SMALL, "learner.policy.lora_targets=default")
+"""The preset's, for learners of another kind, which a preset's settings are not for."""
+LARGE = ("learner.policy.train=lora", "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear")
+WIDE = ("loop.rounds=8", "learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", *LARGE)
+WIDE = (*WIDE, "learner.evaluation_prompts=96")
 ON_FILMS: Runs = {
-    "RLOO": ("text/imdb", WIDE),
-    "RLOO, small adapter": ("text/imdb", ("learner.evaluation_prompts=64",)),
-    "GRPO": ("text/imdb", (*WIDE, "learner.algorithm=grpo")),
-    "REINFORCE": ("text/imdb", (*WIDE, "learner.algorithm=reinforce")),
-    "PPO": ("text/imdb", (*WIDE, "learner.algorithm=ppo", "learner.epochs=2")),
-    "online DPO": (
-        "text/imdb",
-        (*FILMS, "learner.kind=online_dpo", *LIKE_RLOO, "learner.prompts=24", "learner.soft=true"),
-    ),
-    "RAFT": ("text/imdb", (*FILMS, "learner.kind=raft", *LIKE_RLOO, "learner.prompts=6", "learner.minibatch=6")),
+    "RLOO": ("text/imdb", FILMS),
+    "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),
+    "REINFORCE": ("text/imdb", (*FILMS, "learner.algorithm=reinforce")),
+    "PPO": ("text/imdb", (*FILMS, "learner.algorithm=ppo", "learner.epochs=2")),
+    "RAFT": ("text/imdb", (*FILMS, *SMALL, "learner.kind=raft", "learner.minibatch=6")),
+    "RLOO, wide": ("text/imdb", WIDE),
+    "online DPO, wide": ("text/imdb", (*WIDE, "learner.kind=online_dpo", "learner.prompts=24", "learner.soft=true")),
+    "RAFT, wide": ("text/imdb", (*WIDE, "learner.kind=raft", "learner.prompts=6", "learner.minibatch=6")),
 }
 
 

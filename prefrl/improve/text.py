@@ -79,7 +79,7 @@ class TextLearnerSettings(Settings):
     prompts: int = Field(16, ge=1)
     """P: prompts of a batch."""
     responses: int = Field(8, ge=1)
-    """K: responses to each prompt."""
+    """K: responses to each prompt; one for PPO's own 128 prompts."""
     epochs: int = Field(1, ge=1)
     """Passes over each batch."""
     minibatches: int = Field(1, ge=1)
@@ -145,6 +145,8 @@ class TextLearnerSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _fill_in(cls, given: Any) -> Any:
+        if isinstance(given, dict) and given.get("algorithm") == "ppo" and "prompts" in given:
+            given = {"responses": 8} | given  # one response each is for PPO's own 128 prompts: 6 prompts need more
         return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")

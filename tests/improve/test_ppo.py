@@ -216,6 +216,12 @@ def test_adapters_and_a_critic_go_together(toy_reviews: Reviews) -> None:
     assert all("lora_" in name or "critic." in name for name in changed)
 
 
+@pytest.mark.parametrize(("given", "batch"), [({}, (128, 1)), ({"prompts": 6}, (6, 8)), ({"responses": 2}, (128, 2))])
+def test_one_response_a_prompt_is_for_many_prompts_alone(given: dict[str, int], batch: tuple[int, int]) -> None:
+    settings = TextLearnerSettings.model_validate({"algorithm": "ppo"} | given)
+    assert (settings.prompts, settings.responses) == batch
+
+
 def test_a_kl_that_is_not_a_reward_is_refused() -> None:
     with pytest.raises(ValueError, match="kl_in=reward"):
         TextLearnerSettings(algorithm="ppo", kl_in="advantage")
