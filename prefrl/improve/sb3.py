@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from pydantic import Field, JsonValue
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from prefrl.components import ConfigError, Settings, missing, suggest
@@ -311,6 +312,8 @@ class SB3:
         """What the algorithm learns in starts with fresh episodes, and is drawn from `rng`."""
         self._env.start(rng)
         self.model._last_obs = None  # makes learn() reset the environments
+        if "tensorboard_log" not in self._settings.options:
+            self.model.set_logger(Logger(None, []))  # its own would leave a folder in the system's /tmp each time
         try:
             with seeded(rng):
                 self.model.action_space.seed(draw_seed(rng))  # a space has a generator of its own

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from copy import deepcopy
 from dataclasses import replace
 from inspect import signature
@@ -81,6 +82,22 @@ def test_any_algorithm_learns_and_goes_on_bit_for_bit_where_it_was_saved(
         one.improve(Known(), store, np.random.default_rng(2))
     assert _bytes(learner) == _bytes(other)
     assert np.isfinite(learner.evaluate(Known(), np.random.default_rng(3)).metrics["gold"])
+
+
+def test_learning_leaves_no_folder_of_stable_baselines3_behind(
+    store: Store[Segment], monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    learner = _learner(_task("PPO"), _settings("PPO"))
+    assert "loss" in learner.improve(Known(), store, np.random.default_rng(0))
+    assert not list(tmp_path.glob("SB3-*"))
+
+
+def test_tensorboard_is_written_where_it_was_asked_for(store: Store[Segment], tmp_path: Any) -> None:
+    settings = _settings("PPO")
+    settings["options"] |= {"tensorboard_log": str(tmp_path)}
+    _learner(_task("PPO"), settings).improve(Known(), store, np.random.default_rng(0))
+    assert list(tmp_path.rglob("events.out.*"))
 
 
 @every
