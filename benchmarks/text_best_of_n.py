@@ -33,6 +33,7 @@ from scipy.optimize import brentq
 from scipy.special import softmax
 from scipy.stats import entropy
 
+from prefrl.config import presets
 from prefrl.evaluate.best_of_n import expected, kl_bound
 from prefrl.protocols import TextTask
 from prefrl.rundir import open_saved
@@ -41,7 +42,7 @@ from prefrl.storage.checkpoints import load_state
 from prefrl.types import Floats, Response
 
 PRESETS = {"ppo": "-ppo", "raft": "-raft", "online_dpo": "-online-dpo", "dpo": "-dpo"}
-"""Learners with a preset of their own; the others are algorithms of the task's."""
+"""Learners with a preset of their own beside the task's, where there is one; others are algorithms of the task's."""
 RESAMPLES, FEW = 9999, 5
 AT_ONCE = 4
 SHOWN = (1, 2, 4, 8, 16, 32, 64, 128, 256)
@@ -86,9 +87,10 @@ def main() -> None:
 
 def finished(task: str, learner: str, seed: int, size: Size, out: Path) -> Path:
     """The folder of a run, which is made, or taken up where it stopped."""
-    preset = task + PRESETS.get(learner, "")
+    own = task + PRESETS.get(learner, "")
+    preset = own if own in presets() else task
     settings = [f"seed={seed}", *size.settings]
-    if learner not in PRESETS:
+    if preset == task:
         settings.append(f"learner.algorithm={learner}")
     if learner == "dpo":
         settings = [one for one in settings if not one.startswith("learner.updates")]
