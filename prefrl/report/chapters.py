@@ -318,18 +318,9 @@ def _changes(values: Series) -> bool:
 def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
     at = record.numbers
     seconds = {stage: record.series(f"seconds/{stage}") for stage in STAGES}
-    labels = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
-    curves = [Line(record.series(f"label/{n}"), c, n, d) for n, c, d in labels]
-    shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
-    about = IMAGINED if record.imagined else ""
-    curves += [Line(record.series("label/demonstrations"), "improve", "shown", "-.")] if shown else []
     steps = [("learn", "improve", "-"), ("query", "sample", "--"), ("evaluate", "evaluate", ":")]
     return (
-        Card(
-            "Labels",
-            plots.lines("labels", at, curves, zero=True),
-            f"Queries asked, answered and skipped so far.{about}{shown}",
-        ),
+        *_labels(record, facts),
         Card(
             f"{facts.words.spent}s".capitalize(),
             plots.lines("steps", at, [Line(record.series(f"steps/{n}"), c, n, d) for n, c, d in steps], zero=True),
@@ -342,6 +333,19 @@ def _cost(record: Record, facts: Facts) -> tuple[Card, ...]:
         ),
         *_outside(facts),
     )
+
+
+def _labels(record: Record, facts: Facts) -> tuple[Card, ...]:
+    """None where a run has ended without a label."""
+    if facts.finished and not any(facts.labels.values()):
+        return ()
+    curves = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
+    shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
+    curves += [("demonstrations", "improve", "-.")] if shown else []
+    drawn = [Line(record.series(f"label/{n}"), c, n if n != "demonstrations" else "shown", d) for n, c, d in curves]
+    about = IMAGINED if record.imagined else ""
+    said = f"Queries asked, answered and skipped so far.{about}{shown}"
+    return (Card("Labels", plots.lines("labels", record.numbers, drawn, zero=True), said),)
 
 
 def _outside(facts: Facts) -> tuple[Card, ...]:

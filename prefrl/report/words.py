@@ -56,7 +56,8 @@ def _wins(facts: Facts) -> list[str]:
     won, who = facts.won, "the reward it was trained on" if facts.fixed else "its newest reward"
     if won is None:
         return []
-    sure = "" if won.low is None else f" (95 % interval {show_share(won.low)} to {show_share(won.high)})"
+    between = f"95\N{NO-BREAK SPACE}% interval {show_share(won.low)} to {show_share(won.high)}"
+    sure = "" if won.low is None else f" ({between})"
     chance = " That may be chance." if won.low is not None and won.low <= 0.5 <= (won.high or 1.0) else ""
     behaviour = f"{facts.words.behaviour}s"
     return [

@@ -156,6 +156,15 @@ def test_a_number_that_changes_by_rounding_has_no_curve(size: float, shown: bool
     assert ("Step size" in page(run_folder(tmp_path / "run", lines, summary=summary())).text) is shown
 
 
+def test_labels_are_drawn_where_there_are_any(tmp_path: Path) -> None:
+    told = "Queries asked, answered and skipped so far."
+    assert told in page(whole_run(tmp_path / "labels")).text
+    none = {"asked": 0, "answered": 0, "skipped": 0}
+    assert told not in page(whole_run(tmp_path / "none", labels=none)).text
+    before_any = [line(0, **{f"label/{name}": 0 for name in none})]
+    assert told in page(run_folder(tmp_path / "begun", before_any)).text
+
+
 def test_text_runs_show_kl_and_fluency(tmp_path: Path) -> None:
     lines = [line(i, **{"evaluate/kl": 2.0 * i, "evaluate/fluency": 1 - 0.1 * i}) for i in range(4)]
     said = {"kind": "text", "kl": 6.0, "fluency_before": 1.0, "fluency_after": 0.7}
