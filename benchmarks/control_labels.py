@@ -107,13 +107,11 @@ def from_labels(env: str, seed: int, options: argparse.Namespace) -> list[tuple[
     config = configured(env, seed, options)
     name = "-".join([env, str(config.loop.rounds), str(options.labels), str(options.wrong), *options.set, str(seed)])
     folder = options.out / name.replace("/", "-")
-    if not (folder / "summary.json").exists():
-        file = options.out / f"{folder.name}.yaml"
-        options.out.mkdir(parents=True, exist_ok=True)
-        file.write_text(config.dump())
-        again = folder.exists()
-        command = ["resume", str(folder)] if again else ["run", str(file), "--out", str(folder)]
-        subprocess.run([sys.executable, "-m", "prefrl", *command], check=True, stdout=subprocess.DEVNULL)
+    file = options.out / f"{folder.name}.yaml"
+    options.out.mkdir(parents=True, exist_ok=True)
+    file.write_text(config.dump())
+    command = [sys.executable, "-m", "prefrl", "run", str(file), "--out", str(folder)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [(int(row["steps/learn"]), float(row["evaluate/gold"])) for row in rows]
 
