@@ -57,10 +57,6 @@ ON_RUBRIC: Runs = {
     "SFT": ("text/reviews-dpo", (*RUBRIC, "learner.kind=sft", "learner.epochs=4", "learner.evaluation_prompts=256")),
 }
 FILMS = ("learner.evaluation_prompts=64",)
-SMALL = ("learner.updates=6", "learner.prompts=6", "learner.beta=0.05", "learner.learning_rate=1e-3")
-SMALL = (*SMALL, "learner.missing_end_penalty=0", "learner.policy.train=lora", "learner.policy.lora_rank=2")
-SMALL = (*SMALL, "learner.policy.lora_targets=default")
-"""The preset's, for learners of another kind, which a preset's settings are not for."""
 LARGE = ("learner.policy.train=lora", "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear")
 WIDE = ("loop.rounds=8", "learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", *LARGE)
 WIDE = (*WIDE, "learner.evaluation_prompts=96")
@@ -69,7 +65,6 @@ ON_FILMS: Runs = {
     "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),
     "REINFORCE": ("text/imdb", (*FILMS, "learner.algorithm=reinforce")),
     "PPO": ("text/imdb", (*FILMS, "learner.algorithm=ppo", "learner.epochs=2")),
-    "RAFT": ("text/imdb", (*FILMS, *SMALL, "learner.kind=raft", "learner.minibatch=6")),
     "RLOO, wide": ("text/imdb", WIDE),
     "online DPO, wide": ("text/imdb", (*WIDE, "learner.kind=online_dpo", "learner.prompts=24", "learner.soft=true")),
     "RAFT, wide": ("text/imdb", (*WIDE, "learner.kind=raft", "learner.prompts=6", "learner.minibatch=6")),
