@@ -12,7 +12,8 @@ import yaml
 from pydantic import Field, ValidationError, field_validator
 
 from prefrl.components import ConfigError, Settings
-from prefrl.config import Config, explained, placed, read_settings
+from prefrl.config import Config, read_settings
+from prefrl.mistakes import explained, placed
 
 
 class Member(NamedTuple):
