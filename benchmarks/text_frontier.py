@@ -57,9 +57,11 @@ ON_RUBRIC: Runs = {
     "SFT": ("text/reviews-dpo", (*RUBRIC, "learner.kind=sft", "learner.epochs=4", "learner.evaluation_prompts=256")),
 }
 FILMS = ("learner.evaluation_prompts=64",)
-LARGE = ("learner.policy.train=lora", "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear")
-WIDE = ("loop.rounds=8", "learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4", *LARGE)
-WIDE = (*WIDE, "learner.evaluation_prompts=96")
+WIDE = (
+    "loop.rounds=8", "learner.updates=3", "learner.beta=0.01", "learner.learning_rate=4e-4",
+    "learner.policy.train=lora", "learner.policy.lora_rank=16", "learner.policy.lora_targets=all-linear",
+    "learner.evaluation_prompts=96",
+)  # fmt: skip
 ON_FILMS: Runs = {
     "RLOO": ("text/imdb", FILMS),
     "GRPO": ("text/imdb", (*FILMS, "learner.algorithm=grpo")),

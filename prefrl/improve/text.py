@@ -146,7 +146,8 @@ class TextLearnerSettings(Settings):
     @classmethod
     def _fill_in(cls, given: Any) -> Any:
         if isinstance(given, dict) and given.get("algorithm") == "ppo" and "prompts" in given:
-            given = {"responses": 8} | given  # one response each is for PPO's own 128 prompts: 6 prompts need more
+            # One response each is for PPO's own 128 prompts: 6 prompts need more.
+            given = {"responses": cls.model_fields["responses"].default} | given
         return filled_in(given, ALGORITHMS)
 
     @model_validator(mode="after")

@@ -339,10 +339,13 @@ def _labels(record: Record, facts: Facts) -> tuple[Card, ...]:
     """None where a run has ended without a label."""
     if facts.finished and not any(facts.labels.values()):
         return ()
-    curves = [("answered", "learned", "-"), ("asked", "muted", "--"), ("skipped", "gold", ":")]
-    shown = " An answer that shows what to do is counted as shown as well." if facts.labels["demonstrations"] else ""
-    curves += [("demonstrations", "improve", "-.")] if shown else []
-    drawn = [Line(record.series(f"label/{n}"), c, n if n != "demonstrations" else "shown", d) for n, c, d in curves]
+    curves = [("answered", "answered", "learned", "-"), ("asked", "asked", "muted", "--")]
+    curves.append(("skipped", "skipped", "gold", ":"))
+    shown = ""
+    if facts.labels["demonstrations"]:
+        curves.append(("demonstrations", "shown", "improve", "-."))
+        shown = " An answer that shows what to do is counted as shown as well."
+    drawn = [Line(record.series(f"label/{name}"), colour, word, dash) for name, word, colour, dash in curves]
     about = IMAGINED if record.imagined else ""
     said = f"Queries asked, answered and skipped so far.{about}{shown}"
     return (Card("Labels", plots.lines("labels", record.numbers, drawn, zero=True), said),)
