@@ -32,7 +32,7 @@ from prefrl.improve.objectives import (
 )
 from prefrl.protocols import Anchored, ByHand, Columns, I, Policy
 from prefrl.seeding import to_numpy
-from prefrl.types import Integers, Metrics
+from prefrl.types import Integers, Metrics, State
 
 Parts: TypeAlias = Iterable[tuple[Tensor, dict[str, Tensor]]]
 """A loss in parts that add up, each with what it measured: (loss, name -> number)."""
@@ -111,10 +111,25 @@ class Optimizer(Protocol):
 
     def step(self) -> object: ...
 
+    def state_dict(self) -> State: ...
+
+    def load_state_dict(self, state: State, /) -> None: ...
+
 
 def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> Adam:
     """Adam with the eps of the PPO papers' code, which torch's default is a thousand times smaller than."""
     return Adam([{"params": list(parameters), "eps": 1e-5}], learning_rate)
+
+
+def sgd(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torch.optim.SGD:
+    """Steps along the gradient itself, without momentum: each weight moves as much as its gradient says.
+
+    Adam moves a weight whose gradient is noise as far as one whose gradient is not (Mukherjee et al. 2026).
+    """
+    return torch.optim.SGD(list(parameters), learning_rate)
+
+
+OPTIMIZERS: dict[str, Callable[[Iterable[torch.nn.Parameter], float], Optimizer]] = {"adam": adam, "sgd": sgd}
 
 
 def update(

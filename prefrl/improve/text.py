@@ -111,8 +111,11 @@ class TextLearnerSettings(Settings):
     """How far: the share of the policy's parameters in what comes out."""
     reduction: Reduction = "constant"
     """How steps are averaged: `constant` (sums over a response), `token` or `sequence` (see docs)."""
+    optimizer: Literal["adam", "sgd"] = "adam"
+    """What takes the steps: Adam, or the gradient itself (`sgd`, without momentum), which moves each weight as much as
+    its gradient says and wants a learning rate some hundred times as large."""
     learning_rate: float = Field(5e-4, gt=0)
-    """Adam's."""
+    """The optimiser's."""
     schedule: Schedule = "constant"
     """Of the learning rate: it stays, or it falls towards 0 along a line over a round's batches, and begins anew in the
     next."""
@@ -211,7 +214,7 @@ class TextLearner:
     def __init__(self, settings: TextLearnerSettings, task: TextTask, rng: np.random.Generator) -> None:
         self._settings, self._task = settings, task
         network = settings.critic.network if settings.advantage == "gae" else None
-        self._writer = Writer(task, settings, rng, settings.temperature, network)
+        self._writer = Writer(task, settings, rng, settings.temperature, network, settings.optimizer)
         self.policy = self._writer.policy
         self._kl = AdaptiveKL(settings.beta, settings.kl_target or 1.0, settings.kl_horizon)
         self._updates = 0

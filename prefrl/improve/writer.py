@@ -10,7 +10,7 @@ import numpy as np
 
 from prefrl.distributed import each_tensor, joined, world
 from prefrl.evaluate.policies import responses
-from prefrl.improve.gradient import adam
+from prefrl.improve.gradient import OPTIMIZERS, Optimizer
 from prefrl.policies.language import LanguagePolicy, LanguageSettings
 from prefrl.policies.responses import Responses
 from prefrl.protocols import RewardModel, TextTask
@@ -55,6 +55,7 @@ class Writer:
         rng: np.random.Generator,
         temperature: float = 1.0,
         critic: Literal["shared", "own", "reward"] | None = None,
+        optimizer: Literal["adam", "sgd"] = "adam",
     ) -> None:
         """`temperature`: of sampling, and of every log-probability in the objective; `critic`: whose hidden states it
         reads, where there is one."""
@@ -62,13 +63,14 @@ class Writer:
         self.policy = LanguagePolicy(task, temperature, settings.policy, rng)
         if critic is not None:
             self.policy.add_critic(own=critic != "shared")
-        self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
         self.steps = Steps()
+        made = OPTIMIZERS[optimizer]
+        self.optimizer: Optimizer = made(self.policy.parameters(), settings.learning_rate)
         self._gathered = self._gather() if self.policy.spread else {}
         """What rank 0 gathered last of a policy that is spread over ranks: it saves while the others are elsewhere."""
         self.policy.to(device_of(settings.device))
         # To be spread makes other parameters of them.
-        self.optimizer = adam(self.policy.parameters(), settings.learning_rate)
+        self.optimizer = made(self.policy.parameters(), settings.learning_rate)
 
     def ask(self, count: int, each: int, rng: np.random.Generator) -> list[Response]:
         """At least `count` responses to be asked about, `each` to a random prompt, gold attached."""

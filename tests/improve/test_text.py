@@ -367,6 +367,20 @@ def test_a_linear_schedule_ends_each_round_at_0_and_begins_anew(toy_reviews: Rev
     assert one._writer.optimizer.param_groups[0]["lr"] == pytest.approx(0.01)
 
 
+@pytest.mark.parametrize("most", [1e-3, 1e3])
+def test_a_step_of_sgd_is_the_gradient_as_long_as_it_may_be(toy_reviews: Reviews, most: float) -> None:
+    one = learner(toy_reviews, optimizer="sgd", learning_rate=0.5, max_grad_norm=most, updates=1)
+    before, likes = flat(one.policy.model), reward(word(toy_reviews))
+    metrics = one.improve(likes, NO_STORE, np.random.default_rng(1))
+    moved = float((flat(one.policy.model) - before).norm())
+    assert moved == pytest.approx(0.5 * min(metrics["grad_norm"], most), rel=1e-4)
+    resumed = learner(toy_reviews, optimizer="sgd", learning_rate=0.5, max_grad_norm=most, updates=1)
+    resumed.load(one.state())
+    for each in (one, resumed):
+        each.improve(likes, NO_STORE, np.random.default_rng(2))
+    assert torch.equal(flat(one.policy.model), flat(resumed.policy.model))
+
+
 @pytest.mark.parametrize("advantage", ["leave_one_out", "group_normalised", "batch_scaled", "batch_mean", "gae"])
 def test_what_no_reward_scored_teaches_nothing_and_is_counted(toy_reviews: Reviews, advantage: str) -> None:
     """As if it had never been drawn: the others learn from one another alone."""
