@@ -97,7 +97,7 @@ class LearnedReward(VecEnvWrapper):  # type: ignore[misc]
 
     Put it inside of whatever normalises observations: a reward model sees them raw, as rows of numbers. Swap `learned`
     after a fit; with a replay buffer, `relabel` it too. A reward that looks back sees the steps of the running episode.
-    Raises FloatingPointError where a reward is not finite.
+    Raises FloatingPointError where a reward is not finite, and says so where that is the observation's fault.
     """
 
     def __init__(self, venv: VecEnv, reward: StepRewards | None) -> None:
@@ -180,6 +180,12 @@ def scored(reward: StepRewards | None, observations: Floats, actions: Floats, be
     rewards = reward.rewards(observations, actions, begins)
     if not np.isfinite(rewards).all():
         i, t = np.argwhere(~np.isfinite(rewards))[0]
+        if not np.isfinite(observations[i]).all():
+            seen = observations[i][~np.isfinite(observations[i]).all(1)][0]
+            raise FloatingPointError(
+                f"an observation of environment {i} is not finite: {seen}; the simulation diverged, or the environment "
+                "is at fault"
+            )
         raise FloatingPointError(
             f"the learned reward of environment {i} is {rewards[i, t]} at observation {observations[i, t]}, "
             f"action {actions[i, t]}; expected finite rewards: look at the reward model's last fit"

@@ -36,6 +36,7 @@ from prefrl.improve.sb3 import (
     executed,
     relabel,
 )
+from prefrl.improve.vec_env import scored
 from prefrl.policies.rollout import learned_rewards
 from prefrl.protocols import Environments, Transition
 from prefrl.reward_models.mlp import MLPSettings
@@ -266,6 +267,17 @@ def test_the_wrapper_scores_the_observation_before_the_action() -> None:
     actions = np.array([[0.5], [9.0]], np.float32)
     _, rewards, _, _ = env.step(actions)
     np.testing.assert_allclose(rewards, observations[:, 2] + 100 * np.array([0.5, 2.0], np.float32), rtol=1e-5)
+
+
+@pytest.mark.parametrize("at_fault", ["an observation", "the learned reward"])
+def test_who_is_at_fault_for_a_reward_that_is_no_number(at_fault: str) -> None:
+    observations = np.zeros((2, 1, 3), np.float32)
+    observations[1, 0, 2] = np.nan if at_fault == "an observation" else 0.0
+    reward = Known(lambda o, a: o[..., 2] / o[..., 1])  # 0 / 0 where nothing else is wrong
+    alone, begins = np.zeros((2, 1, 1), np.float32), np.ones((2, 1), bool)
+    observations[0, 0, 1] = 1.0
+    with np.errstate(invalid="ignore"), pytest.raises(FloatingPointError, match=f"^{at_fault} of environment 1 is"):
+        scored(reward, observations, alone, begins)
 
 
 def test_a_time_limit_is_told_from_a_termination_and_the_last_observation_kept() -> None:
