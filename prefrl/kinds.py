@@ -96,7 +96,8 @@ class Kind(Generic[C]):
     looked_at: int = 250
     """Open queries whose candidates check questions are made of: large ones stay in memory."""
     exports: Mapping[str, str] = field(default_factory=lambda: {"bundle": ""})
-    """The forms of `prefrl export` that a page offers, and how their files end; "" for folders."""
+    """The forms of `prefrl export` that a page offers, and how their files end; "" for folders. Demonstrations are for
+    pages where people are asked for some."""
     start: str = "start"
     """What a behaviour begins from."""
     behaviour: str = "candidate"
@@ -192,7 +193,7 @@ SEGMENTS = Kind(
         "Clips may start from different positions. Judge what is done from there on, not where it begins.",
         "How smooth or odd a movement looks only matters if the question asks for it.",
     ),
-    exports={"bundle": "", "minari": ""},
+    exports={"demonstrations": ".npz", "bundle": "", "minari": ""},
     behaviour="episode",
     spent="environment step",
 )
@@ -248,6 +249,7 @@ RESPONSES = Kind(
     lease_seconds=600.0,
     looked_at=1000,
     exports={
+        "demonstrations": ".jsonl",
         "judgements": ".jsonl",
         "preferences": ".jsonl",
         "csv": ".csv",

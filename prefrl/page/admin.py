@@ -45,7 +45,7 @@ def _add_overview(router: APIRouter) -> None:
     @router.get("/api/admin/export/{name}", responses=errors(401, 404), response_class=FileResponse)
     async def export(name: str, who: Admin, served: Served) -> FileResponse:
         """Judgements as a file; the header Prefrl-About says, as JSON, what it could not hold."""
-        known = named(served.terms.page.kind).exports
+        known = _exports(served)
         if name not in known:
             raise Refused(404, f"there is no such export: choose from {', '.join(known)}")
         path, done = await run_in_threadpool(_export, served, name)
@@ -123,9 +123,16 @@ def _overview(served: Service) -> Overview:
         overlap=overlap,
         guideline=served.guideline,
         health=health,
-        exports=list(named(served.terms.page.kind).exports),
+        exports=list(_exports(served)),
         **vars(figures),
     )
+
+
+def _exports(served: Service) -> dict[str, str]:
+    """The forms that are offered, and how their files end: demonstrations where people are asked for some."""
+    page = served.terms.page
+    every = named(page.kind).exports.items()
+    return {name: end for name, end in every if name != "demonstrations" or page.ask != "judge"}
 
 
 def _export(served: Service, name: str) -> tuple[Path, Exported]:
@@ -133,7 +140,7 @@ def _export(served: Service, name: str) -> tuple[Path, Exported]:
     from prefrl.exchange.ports import export
 
     folder = Path(tempfile.mkdtemp(prefix="prefrl-export-"))
-    path = folder / f"{name}{named(served.terms.page.kind).exports[name]}"
+    path = folder / f"{name}{_exports(served)[name]}"
     try:
         with Store(served.store.folder, write=False) as store:
             done = export(store, path, name)

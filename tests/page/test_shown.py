@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,16 @@ def test_actions_are_stored_with_the_policys_own_states(service: Service, ann: T
     assert (one.like.episode, one.like.gold, one.demonstration.labeler) == (own.episode, None, "ann")
     assert one.implied(1.0) is not None
     assert service.store.counts() == {"asked": 5, "answered": 1, "skipped": 0, "demonstrations": 1}
+
+
+def test_an_admin_takes_along_what_people_showed(service: Service, ann: TestClient) -> None:
+    boss, address = log_in(service, "boss", "admin"), "/api/admin/export/demonstrations"
+    refused = boss.get(address)
+    assert (refused.status_code, "holds no demonstration" in refused.text) == (409, True)
+    show(ann, ask_for(ann)[0]["assignment_id"], actions=[[0.5, -1.0], *REST])
+    assert boss.get("/api/admin/overview").json()["exports"] == ["demonstrations", "bundle", "minari"]
+    with np.load(io.BytesIO(boss.get(address).content)) as found:
+        np.testing.assert_array_equal(found["actions"][0], np.array([0.5, -1.0], np.float32))
 
 
 def test_who_agrees_with_every_step_shows_the_policys_own_clip(service: Service, ann: TestClient) -> None:
