@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from gymnasium.spaces import Box, Discrete
 from pydantic import Field, field_validator
 
 from prefrl.components import ConfigError, Settings
 from prefrl.envs.control import ControlSettings, GymnasiumTask
+from prefrl.envs.spaces import OwnSpaces
 from prefrl.protocols import Environments, Transition
 from prefrl.types import Bools, Floats, Integers, Segment
 
@@ -81,7 +83,9 @@ def _check_alike(first: tuple[str, GymnasiumTask], other: tuple[str, GymnasiumTa
 
 def _actions(task: GymnasiumTask) -> str:
     if task.action_bounds is None:
-        return f"{task.action_size} choices"
+        own = None if task.outside is None else task.outside.actions
+        plain = own is None or (isinstance(own, Discrete) and own.start == 0)
+        return f"{task.action_size} choices" + ("" if plain else f" of {own}")
     low, high = (side.tolist() for side in task.action_bounds)
     return f"{task.action_size} numbers from {low} to {high}"
 
@@ -95,7 +99,7 @@ def _state_size(task: GymnasiumTask) -> int | None:
 
 @dataclass(frozen=True, eq=False)
 class SeveralTask:
-    """A `prefrl.protocols.ControlTask` that is `prefrl.protocols.Mixed`."""
+    """A `prefrl.protocols.ControlTask` that is `prefrl.protocols.Mixed` and `prefrl.protocols.OfEnvironment`."""
 
     names: tuple[str, ...]
     tasks: tuple[GymnasiumTask, ...]
@@ -135,6 +139,16 @@ class SeveralTask:
     @property
     def notes(self) -> Sequence[str]:
         return [f"{name}: {note}" for name, one in zip(self.names, self.tasks, strict=True) for note in one.notes]
+
+    @property
+    def outside(self) -> OwnSpaces | None:
+        """A row of numbers goes in, with the task's at its end; out comes what each of the environments takes."""
+        own = self.tasks[0].outside
+        return own and OwnSpaces(Box(-np.inf, np.inf, (self.observation_size,)), own.actions)
+
+    @property
+    def variable_horizon(self) -> bool:
+        return any(one.variable_horizon for one in self.tasks)
 
     def environments(self, count: int) -> Environments:
         return Mixture(self, count)

@@ -16,6 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from prefrl import Config, Run, load_policy
 from prefrl.components import ConfigError
 from prefrl.envs.control import ControlSettings, GymnasiumTask
+from prefrl.envs.several import SeveralSettings, SeveralTask, _check_alike
 from prefrl.improve.control import ControlLearnerSettings
 from prefrl.improve.q_learning import QLearningSettings
 from prefrl.improve.sb3 import SB3Settings
@@ -56,7 +57,7 @@ def built(observation: Space[Any] = ROW, action: Space[Any] = ROW, **settings: A
     return ControlSettings.model_validate({"env": "Strict-v0", "segment_steps": 3, **settings}).build()
 
 
-def loaded(task: GymnasiumTask, action: Floats, seen: list[Floats] | None = None) -> Loaded:
+def loaded(task: GymnasiumTask | SeveralTask, action: Floats, seen: list[Floats] | None = None) -> Loaded:
     """Does `action` (A,), whatever it sees."""
 
     def act(observations: Floats, rng: np.random.Generator | None, memory: Memory) -> tuple[Floats, Memory]:
@@ -86,6 +87,16 @@ def test_what_is_chosen_is_what_the_environment_takes(space: Space[Any], chosen:
     assert np.array_equal(several, [expected] * 3)
     assert space.contains(one)
     assert all(space.contains(each) for each in several)
+
+
+def test_a_policy_of_several_tasks_does_what_all_of_them_take() -> None:
+    from_two = built(action=Discrete(2, start=2))
+    lengths = {"env": "Strict-v0", "segment_steps": 3}
+    task = SeveralSettings.model_validate({"tasks": {"one": lengths, "other": lengths}}).build()
+    action, _ = loaded(task, np.eye(2, dtype=np.float32)[1]).predict(np.zeros((3, 4)))
+    assert action.tolist() == [3, 3, 3]
+    with pytest.raises(ConfigError, match=r"2 choices of Discrete\(2, start=2\) and 2 choices"):
+        _check_alike(("one", from_two), ("other", built(action=Discrete(2))))
 
 
 def test_a_block_of_numbers_is_one_again() -> None:
