@@ -122,10 +122,7 @@ def adam(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> Adam
 
 
 def sgd(parameters: Iterable[torch.nn.Parameter], learning_rate: float) -> torch.optim.SGD:
-    """Steps along the gradient itself, without momentum: each weight moves as much as its gradient says.
-
-    Adam moves a weight whose gradient is noise as far as one whose gradient is not (Mukherjee et al. 2026).
-    """
+    """Steps along the gradient itself, without momentum, as Mukherjee et al. (2026) take for policies of language."""
     return torch.optim.SGD(list(parameters), learning_rate)
 
 

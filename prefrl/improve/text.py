@@ -113,7 +113,7 @@ class TextLearnerSettings(Settings):
     """How steps are averaged: `constant` (sums over a response), `token` or `sequence` (see docs)."""
     optimizer: Literal["adam", "sgd"] = "adam"
     """What takes the steps: Adam, or the gradient itself (`sgd`, without momentum), which moves each weight as much as
-    its gradient says and wants a learning rate some hundred times as large."""
+    its gradient says, and wants a learning rate some hundreds of times as large."""
     learning_rate: float = Field(5e-4, gt=0)
     """The optimiser's."""
     schedule: Schedule = "constant"
