@@ -42,9 +42,9 @@ def _add_overview(router: APIRouter) -> None:
         """Everything that the dashboard shows."""
         return await run_in_threadpool(_overview, served)
 
-    @router.get("/api/admin/export/{name}", responses=errors(401, 404), response_class=FileResponse)
+    @router.get("/api/admin/export/{name}", responses=errors(401, 404, 409), response_class=FileResponse)
     async def export(name: str, who: Admin, served: Served) -> FileResponse:
-        """Judgements as a file; the header Prefrl-About says, as JSON, what it could not hold."""
+        """Answers as a file; the header Prefrl-About says, as JSON, what it could not hold."""
         known = _exports(served)
         if name not in known:
             raise Refused(404, f"there is no such export: choose from {', '.join(known)}")
