@@ -96,8 +96,9 @@ class Kind(Generic[C]):
     looked_at: int = 250
     """Open queries whose candidates check questions are made of: large ones stay in memory."""
     exports: Mapping[str, str] = field(default_factory=lambda: {"bundle": ""})
-    """The forms of `prefrl export` that a page offers, and how their files end; "" for folders. Demonstrations are for
-    pages where people are asked for some."""
+    """The forms of `prefrl export` that a page offers, and how their files end; "" for folders."""
+    shown_file: str = ""
+    """How a file of what people showed ends; empty where nobody is asked to show."""
     start: str = "start"
     """What a behaviour begins from."""
     behaviour: str = "candidate"
@@ -193,7 +194,8 @@ SEGMENTS = Kind(
         "Clips may start from different positions. Judge what is done from there on, not where it begins.",
         "How smooth or odd a movement looks only matters if the question asks for it.",
     ),
-    exports={"demonstrations": ".npz", "bundle": "", "minari": ""},
+    exports={"bundle": "", "minari": ""},
+    shown_file=".npz",
     behaviour="episode",
     spent="environment step",
 )
@@ -249,7 +251,6 @@ RESPONSES = Kind(
     lease_seconds=600.0,
     looked_at=1000,
     exports={
-        "demonstrations": ".jsonl",
         "judgements": ".jsonl",
         "preferences": ".jsonl",
         "csv": ".csv",
@@ -259,6 +260,7 @@ RESPONSES = Kind(
         "dataset": "",
         "bundle": "",
     },
+    shown_file=".jsonl",
     start="prompt",
     behaviour="response",
     step="token",

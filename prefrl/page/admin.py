@@ -130,9 +130,9 @@ def _overview(served: Service) -> Overview:
 
 def _exports(served: Service) -> dict[str, str]:
     """The forms that are offered, and how their files end: demonstrations where people are asked for some."""
-    page = served.terms.page
-    every = named(page.kind).exports.items()
-    return {name: end for name, end in every if name != "demonstrations" or page.ask != "judge"}
+    kind = named(served.terms.page.kind)
+    shown = {} if served.terms.page.ask == "judge" else {"demonstrations": kind.shown_file}
+    return shown | dict(kind.exports)
 
 
 def _export(served: Service, name: str) -> tuple[Path, Exported]:
