@@ -207,7 +207,7 @@ def _called(command: list[str], log: str, place: str) -> int:
             return process.returncode
         finally:
             if process is not None:
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever is stopped again meanwhile would leave it alone
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second interrupt would leave the run behind
                 process.send_signal(signal.SIGINT)  # does nothing where it has ended
                 _end(process, time.monotonic() + STOPPING)
                 signal.signal(signal.SIGINT, signal.default_int_handler)

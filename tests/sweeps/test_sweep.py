@@ -1,5 +1,6 @@
 """Many runs as one folder: which ones, what is started, what is kept."""
 
+import _thread
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from prefrl.components import ConfigError
 from prefrl.rundir import RunError, finished
 from prefrl.storage.engines import disown, own, owned
 from prefrl.sweeps.drive import Ended, Sweep
-from prefrl.sweeps.launch import Job, Launcher, Local, Ray, Submitit, launcher
+from prefrl.sweeps.launch import Job, Launcher, Local, Ray, Submitit, _called, launcher
 from prefrl.sweeps.plan import Member, SweepPlan
 
 SMALL = ("loop.rounds=1", "loop.labels=20", "learner.steps_per_round=640", "learner.evaluation_episodes=2")
@@ -149,6 +150,38 @@ def test_a_sweep_that_is_killed_ends_in_the_same_digits_wherever_its_runs_are_st
         ]
         assert rows[0] == rows[1] == rows[2] == rows[3]
         assert finished(killed.folder / member.name)
+
+
+STUBBORN = """
+import signal, time
+def stop(*_):
+    time.sleep(1.5)
+    print("in good order", flush=True)
+    raise SystemExit(1)
+signal.signal(signal.SIGINT, stop)
+print("begun", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.usefixtures("heard")
+def test_a_run_on_a_node_ends_in_good_order_though_it_is_stopped_twice(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+
+    def interrupt() -> None:
+        while not log.exists() or not log.read_text():
+            time.sleep(0.02)
+        _thread.interrupt_main()
+        time.sleep(0.4)  # the first is seen within 0.2 seconds, and the run takes 1.5 to end
+        if "order" not in log.read_text():  # else it would be for whoever runs the tests
+            _thread.interrupt_main()
+
+    twice = threading.Thread(target=interrupt)
+    twice.start()
+    with pytest.raises(KeyboardInterrupt):
+        _called([sys.executable, "-c", STUBBORN], str(log), str(tmp_path))
+    twice.join()
+    assert log.read_text().split("\n")[1:2] == ["in good order"]
 
 
 @pytest.mark.slow
