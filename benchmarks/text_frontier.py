@@ -134,7 +134,9 @@ def main() -> None:
 
 
 def kept(file: Path, learners: Collection[str], seeds: Collection[int]) -> list[dict[str, Any]]:
-    """The rows of a file that are not to be made anew."""
+    """The rows of a file that are not to be made anew; none without a file."""
+    if not file.exists():
+        return []
     with file.open(newline="") as opened:
         rows = list(csv.DictReader(opened))
     found = [{x: value if x == "learner" else json.loads(value) for x, value in one.items()} for one in rows]
