@@ -22,7 +22,7 @@ from prefrl.components import ConfigError, Settings
 from prefrl.protocols import ControlTask, Task, control
 from prefrl.reward_models.ensemble import Ensemble
 from prefrl.reward_models.mlp import MLP
-from prefrl.reward_models.steps import CACHED, StepReward, each_input, uniform
+from prefrl.reward_models.steps import CACHED, StepReward, described, each_input, input_width, uniform
 from prefrl.seeding import generator
 
 
@@ -38,6 +38,8 @@ class CNNSettings(Settings):
     """Filters of the convolutions: 3 x 3, every second pixel, with ReLU."""
     hidden: tuple[int, ...] = (64,)
     """Widths of the layers behind them, which also get the action."""
+    features: Literal["inputs", "observations"] = "inputs"
+    """What it sees of a step: picture and action, or the picture alone (`observations`)."""
     brightest: float | None = Field(255.0, gt=0)
     """Pictures are divided by this; left empty, their mean and std over all pixels are measured in the first fit."""
     gain: float = Field(10.0, gt=0)
@@ -49,8 +51,9 @@ class CNNSettings(Settings):
         """Raises `ConfigError` where the task's observations cannot be such pictures."""
         found = control(task, f"reward kind {self.kind!r} scores control segments")
         _check(self.image, found)
-        network = CNN(self, found.action_size, generator(rng))
-        return StepReward(network, found, self.gain, self.combine, self.measure)
+        describe = described(self.features)
+        network = CNN(self, input_width(found, describe) - found.observation_size, generator(rng))
+        return StepReward(network, found, self.gain, self.combine, self.measure, describe=describe)
 
     def measure(self, steps: Tensor) -> tuple[Tensor, Tensor]:
         """One mean and std for all pixels; the actions each have their own."""

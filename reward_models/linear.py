@@ -16,17 +16,17 @@ from pydantic import Field
 from scipy.optimize import minimize
 from torch import Tensor
 
-from prefrl.components import ConfigError, Settings, feature_functions, suggest
+from prefrl.components import Settings
 from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import CACHED, Describe, StepReward, input_width
+from prefrl.reward_models.steps import CACHED, OWN_FEATURES, StepReward, described, input_width
 from prefrl.seeding import to_numpy
 from prefrl.types import Floats
 
 STEPS = 200
 """Newton steps before giving up; a convex loss takes about ten."""
 Loss = Callable[[Tensor], Tensor]
-OWN = ("inputs", "observations", "quadratic")
+OWN = (*OWN_FEATURES, "quadratic")
 """Features that need no other package."""
 
 
@@ -49,23 +49,9 @@ class LinearSettings(Settings):
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         """Raises `ConfigError` for features that no installed package has."""
         found = control(task, f"reward kind {self.kind!r} scores control segments")
-        describe = self._hand_made()
+        describe = described(self.features, OWN)
         network = Linear(self, input_width(found, describe), rng)
         return StepReward(network, found, 1.0, self.combine, solve=network.solve, describe=describe)
-
-    def _hand_made(self) -> Describe | None:
-        if self.features == "observations":
-            return lambda observations, actions: observations
-        if self.features in OWN:
-            return None
-        installed = feature_functions()
-        if self.features not in installed:
-            hint = suggest(self.features, [*OWN, *installed])
-            raise ConfigError(
-                f"unknown reward.features {self.features!r}; {hint}; or install the package that brings them"
-            )
-        function: Describe = installed[self.features].load()
-        return function
 
 
 class Linear:

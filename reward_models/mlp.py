@@ -19,7 +19,7 @@ from prefrl.components import Settings
 from prefrl.policies.perceptron import Activation, perceptrons
 from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import StepReward, uniform
+from prefrl.reward_models.steps import StepReward, described, input_width, uniform
 from prefrl.seeding import generator
 
 
@@ -33,6 +33,9 @@ class MLPSettings(Settings):
     """Widths of the hidden layers."""
     activation: Activation = "tanh"
     """Between the layers."""
+    features: str = "inputs"
+    """What it sees of a step: observation and action (`inputs`); the observation alone (`observations`), where how
+    somebody acts gives away who it is; or hand-made features, by name in the entry-point group `prefrl.features`."""
     gain: float = Field(10.0, gt=0)
     """A segment's raw score is this times the mean of its networks' outputs, when it has the task's usual length."""
     combine: Ensemble = Ensemble()
@@ -40,8 +43,10 @@ class MLPSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         found = control(task, f"reward kind {self.kind!r} scores control segments")
-        sizes = (found.observation_size + found.action_size, *self.hidden, 1)
-        return StepReward(MLP(self.members, sizes, self.activation, generator(rng)), found, self.gain, self.combine)
+        describe = described(self.features)
+        sizes = (input_width(found, describe), *self.hidden, 1)
+        network = MLP(self.members, sizes, self.activation, generator(rng))
+        return StepReward(network, found, self.gain, self.combine, describe=describe)
 
 
 class MLP:

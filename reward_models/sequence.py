@@ -19,7 +19,7 @@ from torch.nn.functional import gelu, layer_norm, scaled_dot_product_attention
 from prefrl.components import ConfigError, Settings
 from prefrl.protocols import Task, control
 from prefrl.reward_models.ensemble import Ensemble
-from prefrl.reward_models.steps import CACHED, StepReward, uniform
+from prefrl.reward_models.steps import CACHED, StepReward, described, input_width, uniform
 from prefrl.seeding import generator
 
 
@@ -31,6 +31,9 @@ class GRUSettings(Settings):
     """E: how many networks, each from its own random start."""
     width: int = Field(32, ge=1)
     """Units of the recurrent layer."""
+    features: str = "inputs"
+    """What it sees of a step: observation and action (`inputs`); the observation alone (`observations`), where how
+    somebody acts gives away who it is; or hand-made features, by name in the entry-point group `prefrl.features`."""
     memory: int | None = Field(None, ge=1)
     """How many steps a reward looks at, its own included; the length of the task's segments when left out."""
     gain: float = Field(10.0, gt=0)
@@ -40,8 +43,9 @@ class GRUSettings(Settings):
 
     def build(self, task: Task, rng: np.random.Generator) -> StepReward:
         found = control(task, f"reward kind {self.kind!r} scores control segments")
-        network = GRU(self, found.observation_size + found.action_size, self.memory or found.segment_steps, rng)
-        return StepReward(network, found, self.gain, self.combine)
+        describe = described(self.features)
+        network = GRU(self, input_width(found, describe), self.memory or found.segment_steps, rng)
+        return StepReward(network, found, self.gain, self.combine, describe=describe)
 
 
 class GRU:
@@ -108,6 +112,9 @@ class PreferenceTransformerSettings(Settings):
     """Layers of attention and feed-forward units."""
     preference_attention: bool = True
     """Let a step's reward be an attention-weighted mean of what the steps up to it are worth, not its own worth."""
+    features: str = "inputs"
+    """What it sees of a step: observation and action (`inputs`); the observation alone (`observations`), where how
+    somebody acts gives away who it is; or hand-made features, by name in the entry-point group `prefrl.features`."""
     memory: int | None = Field(None, ge=1)
     """How many steps a reward looks at, its own included; the length of the task's segments when left out."""
     gain: float = Field(10.0, gt=0)
@@ -119,9 +126,9 @@ class PreferenceTransformerSettings(Settings):
         found = control(task, f"reward kind {self.kind!r} scores control segments")
         if self.width % self.heads:
             raise ConfigError(f"reward.width must be a multiple of reward.heads, got {self.width} and {self.heads}")
-        inputs = found.observation_size + found.action_size
-        network = PreferenceTransformer(self, inputs, self.memory or found.segment_steps, rng)
-        return StepReward(network, found, self.gain, self.combine)
+        describe = described(self.features)
+        network = PreferenceTransformer(self, input_width(found, describe), self.memory or found.segment_steps, rng)
+        return StepReward(network, found, self.gain, self.combine, describe=describe)
 
 
 class PreferenceTransformer:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from prefrl.components import ConfigError
+from prefrl.components import ConfigError, feature_functions, suggest
 from prefrl.protocols import ControlTask
 from prefrl.reward_models.ensemble import Ensemble, combine, combine_traced
 from prefrl.seeding import to_numpy
@@ -62,6 +62,32 @@ class Network(Protocol):
     @property
     def first(self) -> tuple[Tensor, Tensor] | None:
         """Weight (E, I, H) and bias (E, 1, H) of the one linear layer that the inputs meet, where there is one."""
+
+
+OWN_FEATURES = ("inputs", "observations")
+"""What a network can see of a step without another package."""
+
+
+def observations_alone(observations: Floats, actions: Floats) -> Floats:
+    """Features without the action: where a policy is, and not what it does there, as in T-REX (Brown et al. 2019)."""
+    return observations
+
+
+def described(features: str, own: Sequence[str] = OWN_FEATURES) -> Describe | None:
+    """What the setting `reward.features` names; None for all of a step, as it is.
+
+    Raises `ConfigError` for a name that is neither among a reward's own nor of an installed package.
+    """
+    if features == "observations":
+        return observations_alone
+    if features in own:
+        return None
+    installed = feature_functions()
+    if features not in installed:
+        hint = suggest(features, [*own, *installed])
+        raise ConfigError(f"unknown reward.features {features!r}; {hint}; or install the package that brings them")
+    function: Describe = installed[features].load()
+    return function
 
 
 def input_width(task: ControlTask, describe: Describe | None) -> int:
@@ -219,14 +245,14 @@ class StepReward:
 
     @property
     def traceable(self) -> bool:
-        return self._describe is None
+        return self._describe in (None, observations_alone)
 
     def traced(self, observations: Tensor, actions: Tensor) -> Tensor:
-        both = torch.cat([observations, actions], -1)
-        begins = np.zeros(both.shape[:2], bool)
+        steps = torch.cat([observations, actions], -1) if self._describe is None else observations
+        begins = np.zeros(steps.shape[:2], bool)
         begins[:, 0] = True
-        found = self._member_rewards(((both - self._input_mean) / self._input_std).flatten(0, 1), begins.ravel())
-        return combine_traced(found, self._ensemble, self._fits).view(both.shape[:2])
+        found = self._member_rewards(((steps - self._input_mean) / self._input_std).flatten(0, 1), begins.ravel())
+        return combine_traced(found, self._ensemble, self._fits).view(steps.shape[:2])
 
     def features(self, candidates: Sequence[Segment]) -> Floats:
         """(N, 2 I): the mean and std of a segment's inputs over its steps, normalised as in the last fit.

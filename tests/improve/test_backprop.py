@@ -91,7 +91,9 @@ def _split(policy: MLPPolicy, flat: torch.Tensor) -> list[torch.Tensor]:
     return list(flat.split([part.numel() for part in policy.named().values()]))  # type: ignore[no-untyped-call]
 
 
-@pytest.mark.parametrize("settings", [MLPSettings(combine=Ensemble(by="lower")), GRUSettings()])
+@pytest.mark.parametrize(
+    "settings", [MLPSettings(combine=Ensemble(by="lower")), GRUSettings(), MLPSettings(features="observations")]
+)
 def test_traced_rewards_are_the_rewards(settings: Any) -> None:
     reward, rng = settings.build(point(), _rng(0)), _rng(1)
     seen, done = (rng.standard_normal((3, 7, 1), np.float32) for _ in range(2))

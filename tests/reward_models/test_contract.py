@@ -33,11 +33,11 @@ class Task:
     name, kind, observation_size, action_size, segment_steps, action_bounds = "planted", "control", 6, 2, 5, None
 
 
-def _model(kind: str, seed: int = 0, members: int = 3, combine: dict[str, Any] | None = None) -> Any:
+def _model(kind: str, seed: int = 0, members: int = 3, **options: Any) -> Any:
     settings: Any = settings_class("rewards", kind)
-    return settings.model_validate(
-        {"kind": kind, "members": members, "combine": combine or {}, **SETTINGS[kind]}
-    ).build(Task(), np.random.default_rng(seed))
+    return settings.model_validate({"kind": kind, "members": members, **SETTINGS[kind], **options}).build(
+        Task(), np.random.default_rng(seed)
+    )
 
 
 def _segments(count: int, lengths: Sequence[int] = (5, 3, 8), seed: int = 1) -> list[Segment]:
@@ -85,6 +85,16 @@ def test_shapes_are_as_the_protocol_says(kind: str) -> None:
     assert model.features(segments).shape == (7, 16)
     rng = np.random.default_rng(0)
     assert model.rewards(rng.normal(size=(4, 9, 6)), rng.normal(size=(4, 9, 2))).shape == (4, 9)
+
+
+@EACH
+def test_of_observations_alone_no_action_is_seen(kind: str) -> None:
+    model, segments = _settled(kind, features="observations"), _segments(4)
+    others = [replace(one, actions=one.actions + 1) for one in segments]
+    assert _everything(model, segments) == _everything(model, others)
+    assert _everything(model, segments) != _everything(
+        model, [replace(one, observations=one.observations + 1) for one in segments]
+    )
 
 
 @EACH

@@ -162,7 +162,7 @@ def _bring(monkeypatch: pytest.MonkeyPatch, **functions: Any) -> None:
             self.load = lambda: function
 
     points = {name: Point(function) for name, function in functions.items()}
-    monkeypatch.setattr("prefrl.reward_models.linear.feature_functions", lambda: points)
+    monkeypatch.setattr("prefrl.reward_models.steps.feature_functions", lambda: points)
 
 
 def test_hand_made_features_take_the_place_of_the_inputs(monkeypatch: pytest.MonkeyPatch) -> None:
