@@ -91,6 +91,7 @@ TABLE: dict[Role, dict[str, str]] = {
         "author": "prefrl.label.author:AuthorSettings",
         "crowd": "prefrl.label.crowd:CrowdSettings",
         "demonstrator": "prefrl.label.demonstrator:DemonstratorSettings",
+        "drex": "prefrl.label.drex:DrexSettings",
         "expert": "prefrl.label.expert:ExpertSettings",
         "judge": "prefrl.label.judge:JudgeSettings",
         "oracle": "prefrl.label.oracle:OracleSettings",

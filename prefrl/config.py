@@ -203,8 +203,8 @@ class Config(Settings):
         shows = _shows(labeler)
         if self.loop.labels and isinstance(labeler, Demonstrates) and not labeler.corrects:
             raise ConfigError(
-                f"loop.labels={self.loop.labels}, but the labeler ({self.labeler.model_dump()['kind']}) shows what it "
-                "has, and answers no question: set loop.labels=0, or choose another"
+                f"loop.labels={self.loop.labels}, but the labeler ({self.labeler.model_dump()['kind']}) answers no "
+                "question about the learner's own: set loop.labels=0, or choose another"
             )
         if self.loop.labels and shows != (count == 1):
             says = "shows what to do in the states of one" if shows else "compares two or more"

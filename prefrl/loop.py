@@ -99,6 +99,8 @@ class Loop(Generic[C]):
     """The last round that is done; 0 is the evaluation of the starting policy, -1 is nothing yet."""
     sequence: int = 0
     """The store's newest event when that round was done: a round that is done again asks the same."""
+    fitted_on: int | None = None
+    """The store's newest event when the reward was last fitted: without a newer one it stays as it is."""
     stage: str = "start"
     """What is going on, for whoever watches."""
     _seconds: Metrics = field(default_factory=dict)
@@ -193,6 +195,9 @@ class Loop(Generic[C]):
     def _fit(self, rng: Streams, pool: list[C]) -> Fitted | None:
         from prefrl.fit.trainer import NothingToFit, fit  # torch is heavy, and who reads settings needs none
 
+        newest = self.store.sequence
+        if self.reward.fitted and newest == self.fitted_on:
+            return None  # nothing new was said: more epochs would only fit the same answers closer
         with self._timed("fit"):
             try:
                 fitted = (self.fit or fit)(self.reward, self.store, self.fitting, rng.fit, pool)
@@ -200,6 +205,7 @@ class Loop(Generic[C]):
                 if self.settings.labels and not self.imitates:
                     self._notes.append(f"nothing to fit: {error}")
                 return None
+        self.fitted_on = newest
         if self.fitting.held_out and not fitted.metrics["held_out"]:
             self._notes.append("too few judgements to hold any out: the fit ran all its epochs, and is not measured")
         return fitted

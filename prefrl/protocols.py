@@ -443,7 +443,7 @@ class Demonstrates(Protocol):
 
     @property
     def corrects(self) -> bool:
-        """Whether it answers about the learner's own; else it only shows what it has."""
+        """Whether it answers about the learner's own; else it only shows or judges what it has."""
 
 
 @runtime_checkable

@@ -277,7 +277,8 @@ class Run:
             save_state(folder, "learner", self.loop.learner.state())
             save_state(folder, "reward", self.loop.reward.state())
             write_file(folder / "config.yaml", self.config.dump().encode())
-            write_file(folder / "loop.json", json.dumps({"round": number, "store": self.loop.sequence}).encode())
+            stands = {"round": number, "store": self.loop.sequence, "fitted_on": self.loop.fitted_on}
+            write_file(folder / "loop.json", json.dumps(stands).encode())
         for old in checkpoints(self.folder)[KEEP:]:  # only once the new one stands
             shutil.rmtree(old)
 
@@ -296,6 +297,7 @@ class Run:
         self.loop.reward.load(load_state(folder, "reward"))
         found = json.loads((folder / "loop.json").read_text())
         self.loop.round, self.loop.sequence = found["round"], found["store"]
+        self.loop.fitted_on = found.get("fitted_on")  # older checkpoints do not say it
         self.notes.append(f"going on after round {self.loop.round}")
         # A later row belongs to a round whose checkpoint is missing: it is done again.
         return [row for row in read_metrics(self.folder) if row["round"] <= self.loop.round]

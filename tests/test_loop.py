@@ -276,6 +276,18 @@ def test_rankings_of_several_candidates_go_through_the_loop(tmp_path: Path) -> N
     assert last.metrics["fit/comparisons"] == 3 * len(judgements)
 
 
+def test_a_reward_stays_as_it_is_while_nothing_new_is_said(tmp_path: Path) -> None:
+    loop = build("control/toy", tmp_path, "loop.rounds=3", "loop.labels=8", "loop.first_share=1")
+    rounds = list(loop.run())
+    assert [round.fitted is not None for round in rounds] == [False, True, False, False]
+    assert all("improve/steps" in round.metrics or "evaluate/learned" in round.metrics for round in rounds[1:])
+    loop.store.ask(loop.store.open_queries())
+    one = loop.store.judged()[0]
+    loop.store.retract(one.query.id, loop.labeler.name)
+    loop.settings = loop.settings.model_copy(update={"rounds": 4})
+    assert [round.fitted is not None for round in loop.run()] == [True]
+
+
 def test_a_warning_is_said_once(tmp_path: Path) -> None:
     class Constant:
         fitted, members = True, 1

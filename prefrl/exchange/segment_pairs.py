@@ -2,12 +2,17 @@
 
 For each part P ("train", "eval") arrays `P_obs_1`, `P_obs_2` (pairs, T, O), `P_action_1`, `P_action_2` (pairs, T, A),
 and for each labeler L `P_label_L` (pairs,): 0 where the first segment is better, 1 where the second is, 0.5 for a tie.
+
+Or ranked behaviour, as T-REX learns from it (Brown et al. 2019): the arrays that `segment_arrays` describes and `ranks`
+(N,), the lower the better. Each two segments are a pair; of equal ranks they are a tie.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +23,15 @@ from prefrl.judgements import Comparison
 from prefrl.types import Fields, Query, Segment
 
 ARRAYS = ("obs_1", "obs_2", "action_1", "action_2")
+RANKS = "ranks"
 
 
 def segment_pairs(path: Path) -> Parts:
     """(part and row, what reads it) for each pair. Raises `ValueError` where arrays are missing or do not fit."""
     with archived(path) as archive:
+        if RANKS in archive:
+            yield from _ranked(archive)
+            return
         splits = _splits(archive)
         if not splits:
             raise ValueError(_nothing(archive))
@@ -33,11 +42,14 @@ def segment_pairs(path: Path) -> Parts:
 
 
 def judges(path: Path) -> bool:
-    """Whether a file is of pairs, and not of segments that nobody judged. Raises `ValueError` for what is neither."""
+    """Whether a file is of pairs or ranks, and not of segments that nobody judged.
+
+    Raises `ValueError` for what is neither.
+    """
     with archived(path) as archive:
         if not (_splits(archive) or "observations" in archive):
             raise ValueError(_nothing(archive))
-        return bool(_splits(archive))
+        return bool(_splits(archive)) or RANKS in archive
 
 
 def segments(path: Path) -> dict[str, Segment]:
@@ -58,6 +70,26 @@ def segments(path: Path) -> dict[str, Segment]:
                     one = _segment(arrays, split, side, i)
                     found.setdefault(one.id, (f"{split}, row {i + 1}, segment {side}", one))
         return dict(found.values())
+
+
+def _ranked(archive: Arrays) -> Parts:
+    """(two rows, what reads them) for each two segments of ranked behaviour."""
+    found = {place: replace(one, gold=None) for place, one in rows(archive).items()}  # ranks stand for themselves
+    ranks = archive[RANKS]
+    if ranks.shape != (len(found),) or ranks.dtype.kind not in "fiu" or not np.isfinite(ranks).all():
+        got = f"{ranks.dtype} of shape {ranks.shape}"
+        raise ValueError(f"array ranks: expected a finite number for each of {len(found)} segments, got {got}")
+    if len(found) < 2:
+        raise ValueError("array ranks: expected at least two segments to be ranked, got one")
+    for (one, first), (other, second) in combinations(zip(found, ranks.tolist(), strict=True), 2):
+        pair, preference = (found[one], found[other]), 0.5 + 0.5 * float(np.sign(second - first))
+        yield f"{one} and {other}", partial(_pair, pair, preference)
+
+
+def _pair(pair: tuple[Segment, Segment], preference: float) -> list[Row | str]:
+    query = Query(pair)
+    swapped = query.candidates[0].id != pair[0].id  # a query sorts its candidates by id
+    return [Row(query, Comparison(query.id, 1.0 - preference if swapped else preference))]
 
 
 def _splits(archive: Arrays) -> list[str]:

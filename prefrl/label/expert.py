@@ -186,14 +186,23 @@ def _disturbed(
     if not width:
         return actions
     if task.action_bounds is None:
-        among = rng.integers(task.action_size, size=len(actions)) if legal is None else _one_of(legal, rng)
-        drawn = np.eye(task.action_size, dtype=np.float32)[among]
+        drawn = at_random(task, len(actions), legal, rng)
         return np.where(rng.random((len(actions), 1)) < width, drawn, actions)
     low, high = task.action_bounds
     bounded = np.isfinite(low) & np.isfinite(high)
     half = np.where(bounded, (np.where(bounded, high, 1) - np.where(bounded, low, -1)) / 2, 1)  # what has no bounds: 1
     noisy = actions + width * half * rng.standard_normal(actions.shape)
     found: Floats = np.clip(noisy, low, high).astype(np.float32)
+    return found
+
+
+def at_random(task: ControlTask, count: int, legal: Bools | None, rng: np.random.Generator) -> Floats:
+    """(count, A) actions, each as probable as any other that there is: within the bounds, or one-hot."""
+    if task.action_bounds is None:
+        among = rng.integers(task.action_size, size=count) if legal is None else _one_of(legal, rng)
+        chosen: Floats = np.eye(task.action_size, dtype=np.float32)[among]
+        return chosen
+    found: Floats = rng.uniform(*task.action_bounds, (count, task.action_size)).astype(np.float32)
     return found
 
 

@@ -11,6 +11,7 @@ from recorded_files import JOINED, SEEN, TAKEN, minari_folder, saved
 
 from prefrl.exchange.layout import Layout
 from prefrl.exchange.ports import import_judgements, try_import
+from prefrl.judgements import Comparison
 from prefrl.store import Store
 from prefrl.types import Response, Segment
 
@@ -194,3 +195,34 @@ def test_a_folder_of_rows_that_has_metadata_stays_rows(text_store: Store[Respons
     (tmp_path / "set/rows.jsonl").write_text(json.dumps({"prompt": "p", "chosen": "a", "rejected": "b"}))
     assert import_judgements(tmp_path / "set", text_store).read == 1
     assert len(text_store.judged()) == 1
+
+
+def test_each_two_segments_of_ranked_behaviour_are_a_pair(store: Store[Segment], tmp_path: Path) -> None:
+    three = {"observations": np.stack([SEEN, SEEN + 1, SEEN + 2]), "actions": np.stack([TAKEN] * 3)}
+    path = saved(
+        tmp_path / "x.npz", **three, rewards=three["observations"][:, :, 0], ranks=np.array([2, 0, 2], np.uint8)
+    )
+    done = import_judgements(path, store)
+    judged = store.judged()
+    assert (done.read, len(judged), store.demonstrations()) == (3, 3, [])
+    assert not (store.folder / "gold").exists()
+    found = {}
+    for one in judged:
+        assert isinstance(one.judgement, Comparison)
+        first, second = (int(candidate.observations[0, 0]) for candidate in one.query.candidates)
+        preference = one.judgement.preference
+        found[min(first, second), max(first, second)] = preference if first < second else 1 - preference
+    assert found == {(0, 1): 0.0, (0, 2): 0.5, (1, 2): 1.0}
+
+
+@pytest.mark.parametrize(
+    ("ranks", "told"),
+    [
+        ([0, 1, 2], r"expected a finite number for each of 2 segments, got int64 of shape \(3,\)"),
+        ([0.0, np.nan], "expected a finite number for each of 2 segments, got float64"),
+        (["a", "b"], "expected a finite number for each of 2 segments, got <U1"),
+    ],
+)
+def test_ranks_that_are_not_one_number_a_segment_are_refused(ranks: Any, told: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"x\.npz: array ranks: {told}"):
+        try_import(saved(tmp_path / "x.npz", **JOINED, ranks=np.array(ranks)), None)

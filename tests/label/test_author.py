@@ -66,6 +66,6 @@ def test_questions_that_it_cannot_answer_are_refused_before_one_is_asked(tmp_pat
     asked = ["loop.labels=4", "select.kind=uniform", f"select.candidates={count}"]
     with (
         Store[Response](tmp_path) as store,
-        pytest.raises(ConfigError, match=r"\(author\) shows what it has, and answers no question: set loop\.labels=0"),
+        pytest.raises(ConfigError, match=r"\(author\) answers no question about the learner's own: set loop\.labels=0"),
     ):
         Config.load("text/reviews-demos", asked).build(store)

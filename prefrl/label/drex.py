@@ -1,0 +1,129 @@
+"""Judgements that nobody gives: of a policy's own episodes, those with fewer blind actions are better.
+
+Variant: D-REX (Brown, Goo and Niekum 2020, "Better-than-Demonstrator Imitation Learning via Automatically-Ranked
+Demonstrations", algorithm 1): a policy, as a rule a clone of what was shown, acts while a share of its actions is drawn
+at random. The more of them, the worse it does, so rankings come for free, and a reward that is fitted on them can ask
+for more than the policy does. Pairs are pieces of any two episodes whose shares are unlike enough. Left out: cloning,
+which is a run of its own, and the standard reward that the authors bring to rank 1.
+
+A reward that sees actions learns to tell drawn ones, and not what they lead to: set reward.features=observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from prefrl.components import ConfigError, Settings
+from prefrl.judgements import Comparison
+from prefrl.label.expert import at_random, known
+from prefrl.policies.acting import Actor, forgetful, played
+from prefrl.policies.rollout import whole_episodes
+from prefrl.policies.saved import expert
+from prefrl.protocols import ControlTask, Store, Task, simulated
+from prefrl.sample.segments import piece, placed, segment
+from prefrl.types import Bools, Floats, Query, Segment
+
+
+class DrexSettings(Settings):
+    """Play a policy's episodes with more and more blind actions, and call a piece with fewer of them the better one."""
+
+    kind: Literal["drex"] = "drex"
+    name: str = Field("drex", min_length=1)
+    """Who judges; kept with every answer."""
+    policy: Path | None = None
+    """Whose episodes they are: the folder of a run of control on this task, a clone say, or a zip of stable-baselines3
+    or sb3-contrib, by its mode. Null for the expert that is known for the task, which Pendulum-v1 has."""
+    levels: int = Field(11, ge=2)
+    """How many shares of blind actions there are, evenly from 0 to 1."""
+    episodes: int = Field(10, ge=1)
+    """Whole episodes with each share. Their steps are the simulator's, and in no ledger."""
+    pairs: int = Field(1000, ge=1)
+    """How many pairs of pieces are judged, each of `task.segment_steps` steps, or of all of a shorter episode."""
+    gap: float = Field(0.25, gt=0, le=1)
+    """By how much the shares of a pair differ at least."""
+
+    def build(self, task: Task) -> Drex:
+        found = simulated(task, f"labeler kind {self.kind!r} acts in control tasks")
+        bounds = found.action_bounds
+        if bounds is not None and not np.isfinite(bounds).all():
+            raise ConfigError(f"labeler.kind=drex draws actions within their bounds, and {found.name} has none")
+        actor = forgetful(known(found)) if self.policy is None else expert(self.policy, found, "labeler.policy").actor
+        return Drex(self, found, actor)
+
+
+@dataclass(frozen=True)
+class Drex:
+    """A `Labeler` of its own segments."""
+
+    settings: DrexSettings
+    task: ControlTask
+    actor: Actor
+    """Who acts, without a generator."""
+    demonstrates: bool = False
+    corrects: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
+
+    def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
+        """Play, ask and judge all pairs, once.
+
+        Raises ValueError for a query about other segments: nobody knows how many of their actions were blind.
+        """
+        if not store.counts()["asked"]:
+            store.ask(self.drawn(rng))
+        # What is open was asked here, by a round that may have been killed in between.
+        store.answer([self._judged(query) for query in store.open_queries(self.name)])
+
+    def drawn(self, rng: np.random.Generator) -> list[Query[Segment]]:
+        """Pairs of pieces of episodes that were played with unlike shares. Raises ValueError where there are none."""
+        shares = np.repeat(np.linspace(0, 1, self.settings.levels), self.settings.episodes)
+        episodes = self._played(shares, rng)
+        better, worse = np.nonzero(shares[None] - shares[:, None] > self.settings.gap - 1e-9)
+        pairs = [(episodes[i], episodes[j]) for i, j in zip(better.tolist(), worse.tolist(), strict=True)]
+        pairs = [(one, other) for one, other in pairs if one.context == other.context]
+        if not pairs:
+            raise ValueError(f"labeler.gap={self.settings.gap}: no two episodes of one task are so far apart")
+        drawn = (pairs[at] for at in rng.integers(len(pairs), size=self.settings.pairs))
+        queries = [Query((self._cut(one, rng), self._cut(other, rng))) for one, other in drawn]
+        return list({query.id: query for query in queries}.values())
+
+    def _played(self, shares: Floats, rng: np.random.Generator) -> Sequence[Segment]:
+        """One whole episode with each share (n,); its name says the share."""
+        acting = played(self.actor, None)
+
+        def act(observations: Floats, legal: Bools | None, begins: Bools) -> tuple[Floats, Floats]:
+            clean = acting(observations, legal, begins)[0]
+            drawn = at_random(self.task, len(observations), legal, rng)
+            done = np.where(rng.random(len(shares))[:, None] < shares[:, None], drawn, clean)
+            return done, done
+
+        rollout = whole_episodes(self.task, act, len(shares), rng)
+        lengths = rollout.ends.argmax(1) + 1  # a row may go on after its first end
+        names = [f"{self.name}/{share:.4f}" for share in shares]
+        return placed(self.task, [segment(rollout, i, 0, int(n), names[i]) for i, n in enumerate(lengths)])
+
+    def _cut(self, one: Segment, rng: np.random.Generator) -> Segment:
+        length = min(self.task.segment_steps, len(one))
+        return piece(one, int(rng.integers(len(one) - length + 1)), length)
+
+    def _judged(self, query: Query[Segment]) -> Comparison:
+        first, second = (self._share(one) for one in query.candidates)
+        return Comparison(query.id, 0.5 + 0.5 * float(np.sign(second - first)), self.name)
+
+    def _share(self, one: Segment) -> float:
+        name, _, rest = one.episode.partition("/")
+        share = rest.partition("/")[0]
+        if name != self.name or not share:
+            raise ValueError(
+                f"labeler.kind=drex judges its own episodes alone, and {one.episode!r} is none: set loop.labels=0, and "
+                "choose a folder without other questions"
+            )
+        return float(share)

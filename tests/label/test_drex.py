@@ -1,0 +1,86 @@
+"""D-REX: a policy's own episodes with more and more blind actions, and the pairs that are judged by their number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from prefrl.components import ConfigError
+from prefrl.config import Config
+from prefrl.envs.control import ControlSettings
+from prefrl.envs.experts import EXPERTS
+from prefrl.label.drex import Drex, DrexSettings
+from prefrl.protocols import ControlTask
+from prefrl.store import Store
+from prefrl.types import Query, Segment
+
+_, swing_up = EXPERTS["Pendulum-v1"]
+SMALL = {"levels": 3, "episodes": 2, "pairs": 20}
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> ControlTask:
+    settings: dict[str, Any] = {"env": "Pendulum-v1", "horizon": 20, "segment_steps": 5}
+    return cast("ControlTask", ControlSettings.model_validate(settings).build())
+
+
+def drex(task: ControlTask, **settings: object) -> Drex:
+    return DrexSettings.model_validate(SMALL | settings).build(task)
+
+
+def _share(one: Segment) -> float:
+    return float(one.episode.split("/")[1])
+
+
+def test_of_each_pair_the_piece_with_fewer_blind_actions_is_better(pendulum: ControlTask, tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store:
+        drex(pendulum).answer(store, np.random.default_rng(0))
+        judged = store.judged()
+    assert len(judged) == 20
+    for one in judged:
+        first, second = (_share(candidate) for candidate in one.query.candidates)
+        assert {len(candidate) for candidate in one.query.candidates} == {5}
+        assert abs(first - second) >= 0.25
+        assert one.judgement.preference == float(first < second)  # type: ignore[union-attr]
+
+
+def test_a_share_of_the_actions_is_drawn_and_the_executed_ones_are_kept(pendulum: ControlTask) -> None:
+    played = drex(pendulum, episodes=20)._played(np.repeat([0.0, 0.5, 1.0], 20), np.random.default_rng(0))
+    own = np.array([[np.isclose(one.actions, swing_up(one.observations), atol=1e-4).mean() for one in played]])
+    assert np.allclose(own.reshape(3, 20).mean(1), [1.0, 0.5, 0.0], atol=0.1)
+    assert len({one.id for one in played}) == 60
+
+
+def test_a_gap_leaves_out_pairs_that_are_nearly_alike(pendulum: ControlTask) -> None:
+    queries = drex(pendulum, gap=1.0).drawn(np.random.default_rng(0))
+    assert {tuple(sorted(map(_share, query.candidates))) for query in queries} == {(0.0, 1.0)}
+
+
+def test_it_judges_once_and_a_round_that_was_killed_in_between_goes_on(pendulum: ControlTask, tmp_path: Path) -> None:
+    who = drex(pendulum)
+    with Store[Segment](tmp_path) as store:
+        store.ask(who.drawn(np.random.default_rng(7)))
+        for seed in (7, 8):
+            who.answer(store, np.random.default_rng(seed))
+        assert store.counts() == {"asked": 20, "answered": 20, "skipped": 0}
+
+
+def test_a_question_about_others_segments_is_refused(pendulum: ControlTask, tmp_path: Path) -> None:
+    with Store[Segment](tmp_path) as store:
+        pair = drex(pendulum).drawn(np.random.default_rng(0))[0].candidates
+        store.ask([Query(tuple(replace(one, episode="round 1/0/0") for one in pair))])
+        with pytest.raises(ValueError, match=r"judges its own episodes alone, and 'round 1/0/0' is none"):
+            drex(pendulum).answer(store, np.random.default_rng(0))
+
+
+def test_what_cannot_be_done_is_refused_before_anything_is_played(pendulum: ControlTask, tmp_path: Path) -> None:
+    config, refusal = Config.load("control/pendulum-drex", ["loop.labels=5"]), r"\(drex\) answers no question about the"
+    with Store[Segment](tmp_path) as store, pytest.raises(ConfigError, match=refusal):
+        config.build(store)
+    unbounded = replace(pendulum, action_bounds=(np.full(1, -np.inf), np.full(1, np.inf)))  # type: ignore[type-var]
+    with pytest.raises(ConfigError, match="draws actions within their bounds, and Pendulum-v1 has none"):
+        drex(unbounded)
