@@ -1,0 +1,98 @@
+"""Better than its demonstrator? D-REX, from rankings that nobody gave, on two tasks.
+
+    python benchmarks/demos_drex.py [--task pendulum|halfcheetah] [--seeds 5] [--first 100] [--set KEY=VALUE]
+        [--out runs/demos-drex] [--short]
+
+`pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
+blind actions. `halfcheetah`: the policy is a PPO of our own after 200,000 steps on the true reward (seed 3), the same
+for every seed. The reward is fitted once, and the learner begins from nothing. Returns are gold. `--set` changes the
+runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from control_ppo import BATCH, Ours
+from demos_hopper import said
+
+from prefrl.evaluate.summary import read_summary
+
+HALF_TRAINED, STEPS = 3, 200_000
+CHEETAH = (
+    "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "reward.features=observations", "loop.labels=0",
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=("pendulum", "halfcheetah"), default="pendulum")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=100)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the runs")
+    parser.add_argument("--out", type=Path, default=Path("runs/demos-drex"))
+    parser.add_argument("--short", action="store_true", help="one seed, two rounds, and a policy of 8,192 steps")
+    options = parser.parse_args()
+    tail = "".join(f"-{one}" for one in options.set) + ("-short" if options.short else "")
+    settings = [*options.set, *(["loop.rounds=2", "labeler.pairs=100"] if options.short else [])]
+    seeds = range(options.first, options.first + (1 if options.short else options.seeds))
+    own, theirs, accuracy = list[float](), list[float](), list[float]()
+    for seed in seeds:
+        policy, gold = demonstrator(options.task, seed, options.out, options.short)
+        preset = ["control/pendulum-drex"] if options.task == "pendulum" else ["control/halfcheetah", *CHEETAH]
+        folder = options.out / f"{options.task}{tail}-{seed}"
+        run(folder, [*preset, f"seed={seed}", f"labeler.policy={said(policy)}", *settings])
+        own.append(read_summary(folder)["gold_after"])
+        theirs.append(gold)
+        accuracy.append(read_summary(folder)["reward_accuracy"])
+        print(json.dumps({"seed": seed, "gold": round(own[-1]), "demonstrator": round(gold)}), flush=True)
+    print(
+        json.dumps(
+            {
+                "name": f"demos_drex: {options.task}{tail}",
+                "unit": "true return",
+                "ours": round(statistics.mean(own)),
+                "demonstrator": round(statistics.mean(theirs)),
+                "each": [round(x) for x in own],
+                "of_the_demonstrator": [round(x) for x in theirs],
+                "accuracy_held_out": [round(x, 2) for x in accuracy],
+                "seeds": [seeds[0], seeds[-1]],
+                "short": options.short,
+            }
+        )
+    )
+
+
+def demonstrator(task: str, seed: int, out: Path, short: bool) -> tuple[Path, float]:
+    """The policy that plays, and its return."""
+    if task == "pendulum":
+        folder = out / f"clone-{seed}"
+        run(folder, ["control/pendulum-demos", f"seed={seed}", "labeler.noise=0"])
+        return folder, read_summary(folder)["gold_after"]
+    steps = 2 * BATCH if short else STEPS
+    policy, known = out / f"policy-{steps}.zip", out / f"policy-{steps}.json"
+    if not known.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        torch.set_num_threads(1)
+        side = Ours("HalfCheetah-v5", HALF_TRAINED, steer=True)
+        side.learn(steps // BATCH)
+        side._learner.save(policy)
+        known.write_text(json.dumps(side.gold()))
+    return policy, json.loads(known.read_text())
+
+
+def run(folder: Path, command: Sequence[str]) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "prefrl", "run", *command, "--out", str(folder)], check=True, stdout=subprocess.DEVNULL
+    )
+
+
+if __name__ == "__main__":
+    main()
