@@ -1,12 +1,13 @@
 """Better than its demonstrator? D-REX, from rankings that nobody gave, on two tasks.
 
-    python benchmarks/demos_drex.py [--task pendulum|halfcheetah] [--seeds 5] [--first 100] [--set KEY=VALUE]
+    python benchmarks/demos_drex.py [--task pendulum|halfcheetah|hopper] [--seeds 5] [--first 100] [--set KEY=VALUE]
         [--out runs/demos-drex] [--short]
 
 `pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
-blind actions. `halfcheetah`: the policy is a PPO of our own after 200,000 steps on the true reward (seed 3), the same
-for every seed. The reward is fitted once, and the learner begins from nothing. Returns are gold. `--set` changes the
-runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON object.
+blind actions. The others: it is a PPO of our own after 200,000 steps on the true reward (seed 3), the same for every
+seed. The reward is fitted once, and the learner begins from nothing. Returns are gold, of episodes that no fall ends.
+`--set` changes the runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON
+object.
 """
 
 from __future__ import annotations
@@ -18,22 +19,28 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import torch
 from control_ppo import BATCH, Ours
 from demos_hopper import said
 
+from prefrl.config import Config
 from prefrl.evaluate.summary import read_summary
+from prefrl.label.drex import DrexSettings
+from prefrl.protocols import ControlTask
 
 HALF_TRAINED, STEPS = 3, 200_000
-CHEETAH = (
+BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5"}
+BY_NOISE = (
     "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "reward.features=observations", "loop.labels=0",
 )  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=("pendulum", "halfcheetah"), default="pendulum")
+    parser.add_argument("--task", choices=("pendulum", *BODIES), default="pendulum")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the runs")
@@ -46,7 +53,7 @@ def main() -> None:
     own, theirs, accuracy = list[float](), list[float](), list[float]()
     for seed in seeds:
         policy, gold = demonstrator(options.task, seed, options.out, options.short)
-        preset = ["control/pendulum-drex"] if options.task == "pendulum" else ["control/halfcheetah", *CHEETAH]
+        preset = ["control/pendulum-drex"] if options.task == "pendulum" else [f"control/{options.task}", *BY_NOISE]
         folder = options.out / f"{options.task}{tail}-{seed}"
         run(folder, [*preset, f"seed={seed}", f"labeler.policy={said(policy)}", *settings])
         own.append(read_summary(folder)["gold_after"])
@@ -77,15 +84,16 @@ def demonstrator(task: str, seed: int, out: Path, short: bool) -> tuple[Path, fl
         run(folder, ["control/pendulum-demos", f"seed={seed}", "labeler.noise=0"])
         return folder, read_summary(folder)["gold_after"]
     steps = 2 * BATCH if short else STEPS
-    policy, known = out / f"policy-{steps}.zip", out / f"policy-{steps}.json"
-    if not known.exists():
+    policy = out / f"{task}-{steps}.zip"
+    if not policy.exists():
         out.mkdir(parents=True, exist_ok=True)
         torch.set_num_threads(1)
-        side = Ours("HalfCheetah-v5", HALF_TRAINED, steer=True)
+        side = Ours(BODIES[task], HALF_TRAINED, steer=True)
         side.learn(steps // BATCH)
         side._learner.save(policy)
-        known.write_text(json.dumps(side.gold()))
-    return policy, json.loads(known.read_text())
+    world = cast(ControlTask, Config.load(f"control/{task}").build_task())
+    episodes = DrexSettings(policy=policy).build(world).play(np.zeros(20), np.random.default_rng(seed))
+    return policy, statistics.mean(float(one.gold.sum()) for one in episodes if one.gold is not None)
 
 
 def run(folder: Path, command: Sequence[str]) -> None:

@@ -85,7 +85,7 @@ class Drex:
     def drawn(self, rng: np.random.Generator) -> list[Query[Segment]]:
         """Pairs of pieces of episodes that were played with unlike shares. Raises ValueError where there are none."""
         shares = np.repeat(np.linspace(0, 1, self.settings.levels), self.settings.episodes)
-        episodes = self._played(shares, rng)
+        episodes = self.play(shares, rng)
         better, worse = np.nonzero(shares[None] - shares[:, None] > self.settings.gap - 1e-9)
         pairs = [(episodes[i], episodes[j]) for i, j in zip(better.tolist(), worse.tolist(), strict=True)]
         pairs = [(one, other) for one, other in pairs if one.context == other.context]
@@ -95,7 +95,7 @@ class Drex:
         queries = [Query((self._cut(one, rng), self._cut(other, rng))) for one, other in drawn]
         return list({query.id: query for query in queries}.values())
 
-    def _played(self, shares: Floats, rng: np.random.Generator) -> Sequence[Segment]:
+    def play(self, shares: Floats, rng: np.random.Generator) -> Sequence[Segment]:
         """One whole episode with each share (n,); its name says the share."""
         acting = played(self.actor, None)
 

@@ -49,7 +49,7 @@ def test_of_each_pair_the_piece_with_fewer_blind_actions_is_better(pendulum: Con
 
 
 def test_a_share_of_the_actions_is_drawn_and_the_executed_ones_are_kept(pendulum: ControlTask) -> None:
-    played = drex(pendulum, episodes=20)._played(np.repeat([0.0, 0.5, 1.0], 20), np.random.default_rng(0))
+    played = drex(pendulum, episodes=20).play(np.repeat([0.0, 0.5, 1.0], 20), np.random.default_rng(0))
     own = np.array([[np.isclose(one.actions, swing_up(one.observations), atol=1e-4).mean() for one in played]])
     assert np.allclose(own.reshape(3, 20).mean(1), [1.0, 0.5, 0.0], atol=0.1)
     assert len({one.id for one in played}) == 60
