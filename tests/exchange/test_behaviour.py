@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from recorded_files import JOINED, SEEN, TAKEN, minari_folder, saved
 
+from prefrl.exchange.formats import read_judgements
 from prefrl.exchange.layout import Layout
 from prefrl.exchange.ports import import_judgements, try_import
 from prefrl.judgements import Comparison
@@ -205,7 +206,7 @@ def test_each_two_segments_of_ranked_behaviour_are_a_pair(store: Store[Segment],
     done = import_judgements(path, store)
     judged = store.judged()
     assert (done.read, len(judged), store.demonstrations()) == (3, 3, [])
-    assert not (store.folder / "gold").exists()
+    assert all(candidate.gold is None for one in read_judgements(path).judged for candidate in one.query.candidates)
     found = {}
     for one in judged:
         assert isinstance(one.judgement, Comparison)
