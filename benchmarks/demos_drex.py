@@ -1,7 +1,7 @@
-"""Better than its demonstrator? D-REX, from rankings that nobody gave, on two tasks.
+"""Better than its demonstrator? D-REX, from rankings that nobody gave.
 
-    python benchmarks/demos_drex.py [--task pendulum|halfcheetah|hopper] [--seeds 5] [--first 100] [--set KEY=VALUE]
-        [--out runs/demos-drex] [--short]
+    python benchmarks/demos_drex.py [--task pendulum|halfcheetah|hopper|swimmer] [--seeds 5] [--first 100]
+        [--set KEY=VALUE] [--out runs/demos-drex] [--short]
 
 `pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
 blind actions. The others: it is a PPO of our own after 200,000 steps on the true reward (seed 3), the same for every
@@ -32,7 +32,7 @@ from prefrl.label.drex import DrexSettings
 from prefrl.protocols import ControlTask
 
 HALF_TRAINED, STEPS = 3, 200_000
-BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5"}
+BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5", "swimmer": "Swimmer-v5"}
 BY_NOISE = (
     "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "reward.features=observations", "loop.labels=0",
 )  # fmt: skip
