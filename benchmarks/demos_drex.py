@@ -34,7 +34,8 @@ from prefrl.protocols import ControlTask
 HALF_TRAINED, STEPS = 3, 200_000
 BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5", "swimmer": "Swimmer-v5"}
 BY_NOISE = (
-    "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "reward.features=observations", "loop.labels=0",
+    "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "loop.labels=0",
+    "reward.features=observations", "fitting.weight_decay=3",
 )  # fmt: skip
 
 

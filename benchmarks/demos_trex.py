@@ -86,7 +86,9 @@ def learned(folder: Path, file: Path, seed: int, settings: list[str]) -> float:
     if not reward.exists():
         prefrl(["fit", str(file), "--config", PRESET, f"seed={seed}", *settings, "--out", str(reward)])
     prefrl(["improve", PRESET, "--reward", str(reward), f"seed={seed}", *settings, "--out", str(policy)])
-    return float(read_summary(policy)["gold_after"])
+    found = read_summary(policy)
+    assert not found["labels"]["asked"], "nothing but the ranks is to be learned from"
+    return float(found["gold_after"])
 
 
 def prefrl(command: list[str]) -> None:

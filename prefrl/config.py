@@ -20,6 +20,7 @@ from prefrl.kinds import named
 from prefrl.loop import Loop, LoopSettings
 from prefrl.mistakes import explained, placed
 from prefrl.protocols import (
+    AsksItself,
     ControlTask,
     Demonstrates,
     GoesByGold,
@@ -110,7 +111,13 @@ class Config(Settings):
 
     def notes(self) -> list[str]:
         """What a person should know before it starts: what is named from elsewhere was made in another world."""
-        return other_worlds(self.task, {"labeler": self.labeler, "learner": self.learner})
+        found = other_worlds(self.task, {"labeler": self.labeler, "learner": self.learner})
+        if isinstance(self.labeler, AsksItself) and self.reward.model_dump().get("features") == "inputs":
+            found.append(
+                "reward.features=inputs: the reward sees actions, and may learn to tell blind ones and not what they "
+                "lead to; consider reward.features=observations"
+            )
+        return found
 
     @classmethod
     def load(cls, source: str | Path, overrides: Sequence[str] = ()) -> Config:

@@ -207,7 +207,10 @@ class Loop(Generic[C]):
                 return None
         self.fitted_on = newest
         if self.fitting.held_out and not fitted.metrics["held_out"]:
-            self._notes.append("too few judgements to hold any out: the fit ran all its epochs, and is not measured")
+            self._notes.append(
+                "no judgement could be held out (too few, or all of the same behaviours): the fit ran all its epochs, "
+                "and is not measured"
+            )
         return fitted
 
     def _evaluate(self, rng: Streams) -> Evaluation[C]:

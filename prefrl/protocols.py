@@ -477,6 +477,14 @@ class Examined(Protocol):
         """Of its newest answers, by name."""
 
 
+@runtime_checkable
+class AsksItself(Protocol):
+    """Settings of a labeler that asks questions of its own and answers them, however many labels a run has."""
+
+    @property
+    def asks_itself(self) -> bool: ...
+
+
 class LabelerSettings(Protocol):
     """What chooses a labeler."""
 

@@ -198,9 +198,9 @@ def _align(loop: Loop[C]) -> None:
     """Stand where rank 0 stands."""
     # Not from GPU to GPU: each rank would have a copy on that of rank 0.
     learner, reward = world().first(lambda: each_tensor([loop.learner.state(), loop.reward.state()], to_host))
-    counts = world().first(lambda: (loop.round, loop.sequence))
+    stands = world().first(lambda: (loop.round, loop.sequence, loop.fitted_on))
     if world().rank:
-        loop.round, loop.sequence = counts
+        loop.round, loop.sequence, loop.fitted_on = stands
         loop.learner.load(learner)
         loop.reward.load(reward)
 

@@ -67,7 +67,7 @@ def each(archive: Arrays) -> Iterator[tuple[str, Callable[[], Segment]]]:
     if "actions" not in archive:
         raise ValueError("array actions is missing")
     names = [name for name in ("observations", "actions", "rewards", "lengths") if name in archive]
-    arrays = {name: _read(archive, name) for name in names}
+    arrays = {name: read(archive, name) for name in names}
     _check_shapes(arrays)
     if arrays["actions"].dtype.kind in "iu":
         arrays["actions"] = _one_hot(arrays["actions"], archive)
@@ -95,8 +95,8 @@ def _origins(archive: Arrays, count: int) -> tuple[list[str], list[int]]:
         if "starts" in archive:
             raise ValueError("array starts says from which step of its episode each segment is: add episodes (N,)")
         return [""] * count, [0] * count
-    episodes = _read(archive, "episodes")
-    starts = _read(archive, "starts") if "starts" in archive else np.zeros(count, int)
+    episodes = read(archive, "episodes")
+    starts = read(archive, "starts") if "starts" in archive else np.zeros(count, int)
     if episodes.shape != (count,) or episodes.dtype.kind != "U" or not all(episodes):
         got = f"{episodes.dtype} of shape {episodes.shape}"
         raise ValueError(f"array episodes: expected a text for each of {count} segments, got {got}")
@@ -122,7 +122,8 @@ def named(part: str, one: Segment) -> Segment:
     return replace(one, episode=f"{part}/{content}")
 
 
-def _read(archive: Arrays, name: str) -> np.ndarray:
+def read(archive: Arrays, name: str) -> np.ndarray:
+    """An array. Raises `ValueError` for one of objects."""
     try:
         return archive[name]
     except ValueError as error:  # objects, which are pickled

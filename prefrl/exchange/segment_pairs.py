@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from prefrl.exchange.layout import Parts, Row
-from prefrl.exchange.segment_arrays import Arrays, archived, finite, named, rows
+from prefrl.exchange.segment_arrays import Arrays, archived, finite, named, read, rows
 from prefrl.judgements import Comparison
 from prefrl.types import Fields, Query, Segment
 
@@ -74,8 +74,10 @@ def segments(path: Path) -> dict[str, Segment]:
 
 def _ranked(archive: Arrays) -> Parts:
     """(two rows, what reads them) for each two segments of ranked behaviour."""
+    if splits := _splits(archive):
+        raise ValueError(f"arrays of judged pairs ({splits[0]}_obs_1) and array ranks: put them into a file each")
     found = {place: replace(one, gold=None) for place, one in rows(archive).items()}  # ranks stand for themselves
-    ranks = archive[RANKS]
+    ranks = read(archive, RANKS)
     if ranks.shape != (len(found),) or ranks.dtype.kind not in "fiu" or not np.isfinite(ranks).all():
         got = f"{ranks.dtype} of shape {ranks.shape}"
         raise ValueError(f"array ranks: expected a finite number for each of {len(found)} segments, got {got}")
@@ -87,6 +89,8 @@ def _ranked(archive: Arrays) -> Parts:
 
 
 def _pair(pair: tuple[Segment, Segment], preference: float) -> list[Row | str]:
+    if pair[0].id == pair[1].id:
+        raise ValueError("both are the same segment: leave one out")
     query = Query(pair)
     swapped = query.candidates[0].id != pair[0].id  # a query sorts its candidates by id
     return [Row(query, Comparison(query.id, 1.0 - preference if swapped else preference))]

@@ -18,7 +18,8 @@ from prefrl.exchange.text_rows import form_of
 from prefrl.fit.pairs import batch
 from prefrl.fit.trainer import fit
 from prefrl.kinds import only
-from prefrl.protocols import RewardModel, TextTask
+from prefrl.label.oracle import OracleSettings
+from prefrl.protocols import AsksItself, RewardModel, TextTask
 from prefrl.report.hub import write_readme
 from prefrl.report.report import render_card
 from prefrl.rundir import RunError, open_saved, save_reward
@@ -84,6 +85,8 @@ def with_reward(config: Config, saved: Path, overrides: Sequence[str] = ()) -> C
     reward = Config.reopen(folder / "config.yaml", chosen).reward
     _check_only_combined(dict(flat(fitted.reward.model_dump())), dict(flat(reward.model_dump())), saved)
     update: Json = {"reward": reward, "loop": config.loop.model_copy(update={"labels": 0})}
+    if isinstance(config.labeler, AsksItself):
+        update["labeler"] = OracleSettings()  # who is asked nothing, and so says nothing
     if type(fitted.task) is type(config.task):
         said = {name: getattr(config.task, name) for name in config.task.model_fields_set}
         update["task"] = fitted.task.model_copy(update=said)

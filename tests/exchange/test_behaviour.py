@@ -227,3 +227,11 @@ def test_each_two_segments_of_ranked_behaviour_are_a_pair(store: Store[Segment],
 def test_ranks_that_are_not_one_number_a_segment_are_refused(ranks: Any, told: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"x\.npz: array ranks: {told}"):
         try_import(saved(tmp_path / "x.npz", **JOINED, ranks=np.array(ranks)), None)
+
+
+def test_segments_that_are_alike_or_judged_twice_over_are_no_ranks(tmp_path: Path) -> None:
+    alike = {"observations": np.stack([SEEN, SEEN]), "actions": np.stack([TAKEN, TAKEN]), "ranks": np.arange(2)}
+    with pytest.raises(ValueError, match="row 1 and row 2: both are the same segment"):
+        try_import(saved(tmp_path / "x.npz", **alike), None)
+    with pytest.raises(ValueError, match=r"judged pairs \(train_obs_1\) and array ranks: put them into a file each"):
+        try_import(saved(tmp_path / "y.npz", **alike, train_obs_1=SEEN), None)

@@ -9,12 +9,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from prefrl import stages
 from prefrl.components import ConfigError
 from prefrl.config import Config
 from prefrl.envs.control import ControlSettings
 from prefrl.envs.experts import EXPERTS
+from prefrl.judgements import Comparison
 from prefrl.label.drex import Drex, DrexSettings
+from prefrl.policies.acting import forgetful
 from prefrl.protocols import ControlTask
+from prefrl.rundir import Run
 from prefrl.store import Store
 from prefrl.types import Query, Segment
 
@@ -69,12 +73,34 @@ def test_it_judges_once_and_a_round_that_was_killed_in_between_goes_on(pendulum:
         assert store.counts() == {"asked": 20, "answered": 20, "skipped": 0}
 
 
-def test_a_question_about_others_segments_is_refused(pendulum: ControlTask, tmp_path: Path) -> None:
+def test_what_others_ask_and_answer_stays_theirs(pendulum: ControlTask, tmp_path: Path) -> None:
+    who = drex(pendulum, name="a/b")
     with Store[Segment](tmp_path) as store:
-        pair = drex(pendulum).drawn(np.random.default_rng(0))[0].candidates
-        store.ask([Query(tuple(replace(one, episode="round 1/0/0") for one in pair))])
-        with pytest.raises(ValueError, match=r"judges its own episodes alone, and 'round 1/0/0' is none"):
-            drex(pendulum).answer(store, np.random.default_rng(0))
+        pairs = [query.candidates for query in who.drawn(np.random.default_rng(0))[:2]]
+        theirs = [Query(tuple(replace(one, episode="round 1/0/0") for one in pair)) for pair in pairs]
+        store.ask(theirs)
+        store.answer([Comparison(theirs[0].id, 1.0, "ann")])
+        who.answer(store, np.random.default_rng(0))
+        assert [query.id for query in store.open_queries()] == [theirs[1].id]
+        assert [one.judgement.labeler for one in store.judged()] == ["ann", *["a/b"] * 20]
+
+
+def test_of_several_tasks_each_is_played_with_every_share() -> None:
+    task = cast("ControlTask", Config.load("control/pendulum-several").build_task())
+    who = Drex(DrexSettings.model_validate(SMALL), task, forgetful(lambda seen: swing_up(seen[:, :3])))
+    queries = who.drawn(np.random.default_rng(0))
+    assert len({one.context for query in queries for one in query.candidates}) == 3
+
+
+def test_an_improvement_by_a_given_reward_asks_nothing(tmp_path: Path) -> None:
+    small = ["task.horizon=20", "task.segment_seconds=0.25", "labeler.pairs=20", "labeler.episodes=2", "fitting.epochs=1"]
+    config = Config.load("control/pendulum-drex", [*small, "loop.rounds=1", "learner.steps_per_round=160"])
+    stages.label(config, tmp_path / "ranked")
+    stages.fit_reward(config, tmp_path / "ranked", tmp_path / "reward")
+    with Run(stages.with_reward(config, tmp_path / "reward"), tmp_path / "policy", tmp_path / "reward") as run:
+        rounds = list(run)
+    assert [round.fitted for round in rounds] == [None, None]
+    assert rounds[-1].metrics["label/asked"] == 0
 
 
 def test_what_cannot_be_done_is_refused_before_anything_is_played(pendulum: ControlTask, tmp_path: Path) -> None:
