@@ -138,6 +138,20 @@ def test_a_run_of_control_that_lost_a_rank_ends_on_one_in_the_bytes_of_one_that_
 
 
 @slow
+def test_on_two_ranks_a_run_goes_on_where_nothing_new_was_said(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    first = started("run", "control/toy", *BODIES, "loop.first_share=1", "--ranks", "2", "--out", str(folder))
+    while len(rows(folder)) < 3:
+        assert first.poll() is None
+        time.sleep(0.02)
+    first.kill()
+    assert first.wait(WITHIN) != 0
+    assert len(rows(folder)) < 9
+    assert started("resume", str(folder), "--ranks", "2").wait() == 0
+    assert [row.get("fit/snapshot") is not None for row in rows(folder)] == [False, True, *[False] * 7]
+
+
+@slow
 def test_what_ranks_cannot_share_is_refused_in_one_line(tmp_path: Path) -> None:
     few = ("control/toy", "learner.environments=1", "--ranks", "2", "--out", str(tmp_path / "run"))
     assert started("run", *few, log=tmp_path / "log").wait() == 2

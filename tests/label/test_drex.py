@@ -93,7 +93,13 @@ def test_of_several_tasks_each_is_played_with_every_share() -> None:
 
 
 def test_an_improvement_by_a_given_reward_asks_nothing(tmp_path: Path) -> None:
-    small = ["task.horizon=20", "task.segment_seconds=0.25", "labeler.pairs=20", "labeler.episodes=2", "fitting.epochs=1"]
+    small = [
+        "task.horizon=20",
+        "task.segment_seconds=0.25",
+        "labeler.pairs=20",
+        "labeler.episodes=2",
+        "fitting.epochs=1",
+    ]
     config = Config.load("control/pendulum-drex", [*small, "loop.rounds=1", "learner.steps_per_round=160"])
     stages.label(config, tmp_path / "ranked")
     stages.fit_reward(config, tmp_path / "ranked", tmp_path / "reward")
