@@ -1,11 +1,11 @@
 """Better than its demonstrator? D-REX, from rankings that nobody gave.
 
-    python benchmarks/demos_drex.py [--task pendulum|halfcheetah|hopper|swimmer] [--seeds 5] [--first 100]
+    python benchmarks/demos_drex.py [--task pendulum|halfcheetah|hopper] [--seeds 5] [--first 100]
         [--set KEY=VALUE] [--out runs/demos-drex] [--short]
 
 `pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
-blind actions. The others: it is a PPO of our own after 200,000 steps on the true reward (seed 3), the same for every
-seed. The reward is fitted once, and the learner begins from nothing. Returns are gold, of episodes that no fall ends.
+blind actions; the learner begins from nothing. The others: it is a PPO of our own after 200,000 steps on the true reward
+(seed 3), the same for every seed, and the learner begins from it. Returns are gold, of episodes that no fall ends.
 `--set` changes the runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON
 object.
 """
@@ -32,7 +32,7 @@ from prefrl.label.drex import DrexSettings
 from prefrl.protocols import ControlTask
 
 HALF_TRAINED, STEPS = 3, 200_000
-BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5", "swimmer": "Swimmer-v5"}
+BODIES = {"halfcheetah": "HalfCheetah-v5", "hopper": "Hopper-v5"}
 BY_NOISE = (
     "labeler.kind=drex", "labeler.episodes=5", "labeler.pairs=2000", "loop.labels=0",
     "reward.features=observations", "fitting.weight_decay=3",
@@ -54,7 +54,8 @@ def main() -> None:
     own, theirs, accuracy = list[float](), list[float](), list[float]()
     for seed in seeds:
         policy, gold = demonstrator(options.task, seed, options.out, options.short)
-        preset = ["control/pendulum-drex"] if options.task == "pendulum" else [f"control/{options.task}", *BY_NOISE]
+        started = [f"control/{options.task}", *BY_NOISE, f"learner.start={said(policy)}"]
+        preset = ["control/pendulum-drex"] if options.task == "pendulum" else started
         folder = options.out / f"{options.task}{tail}-{seed}"
         run(folder, [*preset, f"seed={seed}", f"labeler.policy={said(policy)}", *settings])
         own.append(read_summary(folder)["gold_after"])
