@@ -4,8 +4,8 @@
         [--set KEY=VALUE] [--out runs/demos-drex] [--short]
 
 `pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
-blind actions; the learner begins from nothing. The others: it is a PPO of our own after 200,000 steps on the true reward
-(seed 3), the same for every seed, and the learner begins from it. Returns are gold, of episodes that no fall ends.
+blind actions; the learner begins from nothing. The others: it is a PPO of our own after 200,000 steps on the true
+reward (seed 3), the same for every seed, and the learner begins from it. Returns are gold, of episodes that no fall ends.
 `--set` changes the runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON
 object.
 """
@@ -71,7 +71,7 @@ def main() -> None:
                 "demonstrator": round(statistics.mean(theirs)),
                 "each": [round(x) for x in own],
                 "of_the_demonstrator": [round(x) for x in theirs],
-                "accuracy_held_out": [round(x, 2) for x in accuracy],
+                "accuracy_held_out": [x and round(x, 2) for x in accuracy],
                 "seeds": [seeds[0], seeds[-1]],
                 "short": options.short,
             }
