@@ -5,7 +5,7 @@
 
 `pendulum`: four clean episodes of the known expert are cloned, and the clone is the policy that plays with ever more
 blind actions; the learner begins from nothing. The others: it is a PPO of our own after 200,000 steps on the true
-reward (seed 3), the same for every seed, and the learner begins from it. Returns are gold, of episodes that no fall ends.
+reward (seed 3), the same for every seed, and the learner begins from it. Returns are gold, and no fall ends an episode.
 `--set` changes the runs, as in `--set reward.features=inputs`. Finished runs are taken up. The last line is one JSON
 object.
 """
