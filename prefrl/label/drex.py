@@ -59,7 +59,7 @@ class DrexSettings(Settings):
         return Drex(self, found, actor)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Drex:
     """A `Labeler` of its own segments."""
 
@@ -69,8 +69,8 @@ class Drex:
     """Who acts, without a generator."""
     demonstrates: bool = False
     corrects: bool = False
-    _asked: list[bool] = field(default_factory=list)
-    """Not empty once its own pairs are known to be in the store."""
+    asked: bool = field(default=False, init=False)
+    """Whether its own pairs are known to be in the store."""
 
     @property
     def name(self) -> str:
@@ -79,12 +79,12 @@ class Drex:
     def answer(self, store: Store[Segment], rng: np.random.Generator) -> None:
         """Play, ask and judge all pairs, once. What others ask and answer in the same store stays theirs."""
         own = [query for query in store.open_queries(self.name) if self._is_own(query)]
-        if not (own or self._asked or any(self._is_own(one.query) for one in store.judged())):
+        if not (own or self.asked or any(self._is_own(one.query) for one in store.judged())):
             own = self.drawn(rng)
             store.ask(own)
         # What was open was asked here, by a round that was killed in between.
         store.answer([self._judged(query) for query in own])
-        self._asked.append(True)
+        self.asked = True
 
     def _is_own(self, query: Query[Segment]) -> bool:
         return all(one.episode.startswith(f"{self.name}/") for one in query.candidates)
