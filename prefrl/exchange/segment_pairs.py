@@ -84,16 +84,21 @@ def _ranked(archive: Arrays) -> Parts:
     if len(found) < 2:
         raise ValueError("array ranks: expected at least two segments to be ranked, got one")
     for (one, first), (other, second) in combinations(zip(found, ranks.tolist(), strict=True), 2):
-        pair, preference = (found[one], found[other]), 0.5 + 0.5 * float(np.sign(second - first))
-        yield f"{one} and {other}", partial(_pair, pair, preference)
+        pair, value = (found[one], found[other]), 0.5 + 0.5 * float(np.sign(first - second))
+        yield f"{one} and {other}", partial(_pair, pair, value)
 
 
-def _pair(pair: tuple[Segment, Segment], preference: float) -> list[Row | str]:
+def _pair(pair: tuple[Segment, Segment], value: float) -> list[Row | str]:
     if pair[0].id == pair[1].id:
         raise ValueError("both are the same segment: leave one out")
+    return [_compared(pair, value)]
+
+
+def _compared(pair: tuple[Segment, Segment], value: float, labeler: str = "", split: str = "") -> Row:
+    """A comparison whose value says how probably the second is better, as the labels of a file do."""
     query = Query(pair)
     swapped = query.candidates[0].id != pair[0].id  # a query sorts its candidates by id
-    return [Row(query, Comparison(query.id, 1.0 - preference if swapped else preference))]
+    return Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split)
 
 
 def _splits(archive: Arrays) -> list[str]:
@@ -132,14 +137,12 @@ def _arrays(file: Fields, split: str) -> tuple[dict[str, np.ndarray], dict[str, 
 def _rows(arrays: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], split: str, i: int) -> list[Row | str]:
     """One pair with every labeler's judgement on it."""
     first, second = (_segment(arrays, split, side, i) for side in ("1", "2"))
-    query = Query((first, second))
-    swapped = query.candidates[0].id != first.id  # a query sorts its candidates by id
     found: list[Row | str] = []
     for labeler, values in labels.items():
         value = float(values[i])
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"label_{labeler}: expected 0 (first better) to 1 (second better), got {value}")
-        found.append(Row(query, Comparison(query.id, value if swapped else 1.0 - value, labeler), split))
+        found.append(_compared((first, second), value, labeler, split))
     return found
 
 

@@ -26,7 +26,7 @@ from prefrl.policies.acting import Actor, forgetful, played
 from prefrl.policies.rollout import whole_episodes
 from prefrl.policies.saved import expert
 from prefrl.protocols import ControlTask, Mixed, Store, Task, simulated
-from prefrl.sample.segments import piece, placed, segment
+from prefrl.sample.segments import first_episodes, piece
 from prefrl.types import Bools, Floats, Query, Segment
 
 
@@ -114,9 +114,7 @@ class Drex:
             return done, done
 
         rollout = whole_episodes(self.task, act, len(shares), rng)
-        lengths = rollout.ends.argmax(1) + 1  # a row may go on after its first end
-        names = [f"{self.name}/{share:.4f}" for share in shares]
-        return placed(self.task, [segment(rollout, i, 0, int(n), names[i]) for i, n in enumerate(lengths)])
+        return first_episodes(self.task, rollout, [f"{self.name}/{share:.4f}" for share in shares])
 
     def _cut(self, one: Segment, rng: np.random.Generator) -> Segment:
         length = min(self.task.segment_steps, len(one))

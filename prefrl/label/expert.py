@@ -26,7 +26,7 @@ from prefrl.policies.acting import Actor, Memory, forgetful, played
 from prefrl.policies.rollout import whole_episodes
 from prefrl.policies.saved import expert
 from prefrl.protocols import ControlTask, Store, Task, simulated
-from prefrl.sample.segments import placed, segment
+from prefrl.sample.segments import first_episodes
 from prefrl.types import Bools, Floats, Integers, Query, Segment
 
 Advice: TypeAlias = Callable[[Floats], Floats]
@@ -174,10 +174,7 @@ def play(
         return clean, _disturbed(clean, task, settings.noise, noise, legal)
 
     rollout = whole_episodes(task, act, episodes, rng)
-    shown = replace(rollout, actions=rollout.choices)
-    # A row may go on after its first end.
-    lengths = rollout.ends.argmax(1) + 1
-    return placed(task, [segment(shown, i, 0, int(lengths[i]), settings.name) for i in range(episodes)])
+    return first_episodes(task, replace(rollout, actions=rollout.choices), [settings.name] * episodes)
 
 
 def _disturbed(

@@ -83,6 +83,12 @@ def segment(rollout: Rollout, env: int, t: int, length: int, name: str) -> Segme
     )
 
 
+def first_episodes(task: ControlTask, rollout: Rollout, names: Sequence[str]) -> list[Segment]:
+    """The first episode of each of n environments, whole; a row may go on after it. `names` are as in `segment`."""
+    lengths = rollout.ends.argmax(1) + 1
+    return placed(task, [segment(rollout, i, 0, int(n), names[i]) for i, n in enumerate(lengths)])
+
+
 def piece(one: Segment, start: int, length: int) -> Segment:
     """Some steps of a segment, with their states and gold."""
     part = slice(start, start + length)
